@@ -1,0 +1,35 @@
+"""The one error that a user's input can cause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["InputError"]
+
+
+class InputError(ValueError):
+    """A file, field or argument that the user gave is not usable.
+
+    The message is one line and names the file, the field, the value found, what was expected and how to mend it; the
+    commands print it and exit with code 2.
+    """
+
+    def __init__(
+        self,
+        expected: str,
+        *,
+        file: str | Path | None = None,
+        field: str | None = None,
+        value: object = None,
+        mend: str | None = None,
+    ) -> None:
+        self.file, self.field, self.value, self.expected, self.mend = file, field, value, expected, mend
+        where = ": ".join(str(part) for part in (file, field) if part is not None)
+        found = "" if value is None else f" (found {_short(value)})"
+        text = f"{where}: {expected}{found}" if where else f"{expected}{found}"
+        super().__init__(f"{text}; {mend}" if mend else text)
+
+
+def _short(value: object, limit: int = 80) -> str:
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= limit else text[: limit - 3] + "..."
