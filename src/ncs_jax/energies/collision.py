@@ -1,0 +1,335 @@
+"""Collision with the body, equation (12), from two signed distances, each with exact and with candidate search.
+
+A distance is found in two parts. The *search* names the nearest body vertex or triangle of every cloth vertex; it works on
+integers and carries no derivative. The *distance* is then a smooth function of the cloth and of that feature.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ncs_jax.mesh import topology, vertex_rings
+from ncs_jax.numerics import angle_between, normalize
+
+__all__ = [
+    "Surface",
+    "collision",
+    "face_normals",
+    "nearest_triangle",
+    "nearest_vertex",
+    "plane_distance",
+    "surface_from",
+    "triangle_distance",
+    "vertex_normals",
+]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Surface:
+    """What collision needs to know once about the part of the body that a garment can touch.
+
+    `cloth_blocks`, `vertex_blocks` and `face_blocks` are compact groups of cloth vertices, body vertices and body faces,
+    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group.
+    """
+
+    faces: Int[Array, "faces 3"]
+    rings: Int[Array, "body most"]
+    face_edges: Int[Array, "faces 3"]
+    edge_sides: Int[Array, "edges 2"]
+    cloth_blocks: Int[Array, "blocks size"]
+    cloth_place: Int[Array, verts]
+    vertex_blocks: Int[Array, "clusters vertices"]
+    face_blocks: Int[Array, "groups triangles"]
+    groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
+
+
+def _blocks(points: np.ndarray, size: int) -> np.ndarray:
+    """Halve the points along their longest extent until no group is larger than `size`; (groups, largest) indices."""
+    groups = [np.arange(len(points))]
+    while max(len(g) for g in groups) > size:
+        halves = []
+        for g in groups:
+            axis = np.ptp(points[g], axis=0).argmax()
+            g = g[np.argsort(points[g, axis], kind="stable")]
+            halves += [g[: (len(g) + 1) // 2], g[(len(g) + 1) // 2 :]]
+        groups = [g for g in halves if len(g)]
+    largest = max(len(g) for g in groups)
+    return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
+
+
+def surface_from(
+    cloth: np.ndarray,
+    body: np.ndarray,
+    faces: np.ndarray,
+    *,
+    groups: int = 10,
+    cloth_size: int = 40,
+    body_size: int = 40,
+) -> Surface:
+    """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body."""
+    cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
+    cloth_blocks = _blocks(cloth, cloth_size)
+    place = np.zeros(len(cloth), np.int32)
+    place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
+    edges, sides, _ = topology(faces)
+    key = {tuple(sorted(e)): i for i, e in enumerate(edges.tolist())}
+    face_edges = [[key[tuple(sorted((f[i], f[(i + 1) % 3])))] for i in range(3)] for f in faces.tolist()]
+    return Surface(
+        faces=jnp.asarray(faces, jnp.int32),
+        rings=jnp.asarray(vertex_rings(faces, len(body))),
+        face_edges=jnp.asarray(np.asarray(face_edges, np.int32).reshape(-1, 3)),
+        edge_sides=jnp.asarray(sides),
+        cloth_blocks=jnp.asarray(cloth_blocks),
+        cloth_place=jnp.asarray(place),
+        vertex_blocks=jnp.asarray(_blocks(body, body_size)),
+        face_blocks=jnp.asarray(_blocks(body[faces].mean(axis=1), body_size)),
+        groups=groups,
+    )
+
+
+def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> Float[Array, "faces 3"]:
+    """Unit normals; zero for a collapsed face."""
+    a, b, c = body[faces[:, 0]], body[faces[:, 1]], body[faces[:, 2]]
+    return normalize(jnp.cross(b - a, c - a))
+
+
+def vertex_normals(body: Float[Array, "body 3"], surface: Surface) -> Float[Array, "body 3"]:
+    """Area-weighted unit normals of the body's vertices."""
+    a, b, c = (body[surface.faces[:, i]] for i in range(3))
+    area = jnp.concatenate([jnp.cross(b - a, c - a), jnp.zeros_like(body[:1])])
+    return normalize(jnp.sum(area[surface.rings], axis=1))
+
+
+# --- search ---------------------------------------------------------------------------------------------------------
+
+
+def _squared_to_points(x, points):
+    """|x - p|^2 with the components on the leading axis, kept apart so that the cloth fills the vector lanes."""
+    return sum((x[i] - points[i]) ** 2 for i in range(3))
+
+
+def _squared_to_triangles(x, corners):
+    """Exact squared distance to triangles; `corners` is (3 corners, 3 components, ...)."""
+    a, b, c = corners
+
+    def dot(p, q):
+        return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+
+    def minus(p, q):
+        return [p[i] - q[i] for i in range(3)]
+
+    def cross(p, q):
+        return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
+
+    def to_segment(p, edge):
+        length = dot(edge, edge)
+        t = jnp.clip(dot(p, edge) / jnp.where(length > 0, length, 1), 0, 1)
+        rest = [p[i] - t * edge[i] for i in range(3)]
+        return dot(rest, rest)
+
+    ab, bc, ca = minus(b, a), minus(c, b), minus(a, c)
+    normal = cross(ab, minus(c, a))
+    square = dot(normal, normal)
+    pa, pb, pc = minus(x, a), minus(x, b), minus(x, c)
+    inside = (dot(cross(ab, pa), normal) > 0) & (dot(cross(bc, pb), normal) > 0) & (dot(cross(ca, pc), normal) > 0)
+    plane = dot(pa, normal) ** 2 / jnp.where(square > 0, square, 1)
+    border = jnp.minimum(jnp.minimum(to_segment(pa, ab), to_segment(pb, bc)), to_segment(pc, ca))
+    return jnp.where(inside & (square > 0), plane, border)
+
+
+def _scan_nearest(x, features, names, squared):
+    """Nearest of a list of features to each lane of x, by a scan over the list (the fastest form on CPUs).
+
+    `features` (list, ..., lanes or 1), `names` (list, ...): the distance and the name of the nearest one.
+    """
+
+    def step(best, item):
+        feature, name = item
+        d = squared(x, feature)
+        closer = d < best[0]
+        return (jnp.where(closer, d, best[0]), jnp.where(closer, name, best[1])), None
+
+    start = (jnp.full(x.shape[1:], jnp.inf, x.dtype), jnp.zeros(x.shape[1:], jnp.int32))
+    return lax.scan(step, start, (features, names), unroll=8)[0]
+
+
+def _all(x, features, squared):
+    """Search every feature: features (count, ..., 3) for x (lanes, 3)."""
+    lanes = jnp.moveaxis(features, -1, 1 if features.ndim == 2 else 2)
+    return _scan_nearest(x.T, lanes[..., None], jnp.arange(len(features), dtype=jnp.int32), squared)
+
+
+def _candidates(x, features, blocks, surface, squared):
+    """Nearest feature among the groups nearest to each cloth group, and whether no other group can hold a nearer one.
+
+    The gap between the two bounding boxes bounds every distance between two groups from below: a vertex whose nearest
+    candidate is closer than the gap to the first group left out has the right one for certain.
+    """
+    grouped = features[blocks]  # (clusters, size, [3 corners,] 3)
+    corners = grouped.reshape(len(blocks), -1, 3)
+    cloth = x[surface.cloth_blocks]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    gap = jnp.maximum(jnp.maximum(low - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high), 0)
+    gap = jnp.sum(gap * gap, axis=-1)
+    count = min(surface.groups, len(blocks))
+    nearest, chosen = lax.top_k(-gap, min(count + 1, len(blocks)))
+    bound = -nearest[:, count] if len(blocks) > count else jnp.full(len(cloth), jnp.inf, x.dtype)
+    chosen = chosen[:, :count]
+    listed = grouped[chosen].reshape(len(cloth), -1, *features.shape[1:])
+    names = blocks[chosen].reshape(len(cloth), -1)
+    # (list, [3 corners,] 3, cloth groups, 1) against x (3, cloth groups, lanes)
+    listed = jnp.moveaxis(listed, 0, -1)[..., None]
+    square, name = _scan_nearest(jnp.moveaxis(cloth, -1, 0), listed, names.T[..., None], squared)
+    proven = square <= bound[:, None]
+    place = surface.cloth_place
+    return name.reshape(-1)[place], proven.reshape(-1)[place]
+
+
+def _repair(x, name, proven, features, squared, size=128):
+    """Search everything for the vertices whose candidate is not proven, a few at a time, until none is left."""
+    size = min(size, len(x))
+
+    def pending(state):
+        return ~jnp.all(state[1])
+
+    def mend(state):
+        name, proven = state
+        rows = jnp.nonzero(~proven, size=size, fill_value=len(x))[0]
+        _, found = _all(x.at[rows].get(mode="clip"), features, squared)
+        return name.at[rows].set(found, mode="drop"), proven.at[rows].set(True, mode="drop")
+
+    return lax.while_loop(pending, mend, (name, proven))[0]
+
+
+def _search(x, features, blocks, surface, squared, exact):
+    x, features = lax.stop_gradient(x), lax.stop_gradient(features)
+    name, proven = _candidates(x, features, blocks, surface, squared)
+    return (_repair(x, name, proven, features, squared) if exact else name), proven
+
+
+def nearest_vertex(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
+) -> tuple[Int[Array, verts], Bool[Array, verts]]:
+    """Nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
+
+    With `exact` the rest is searched in full, so the answer is that of a full search whatever the pose; without it the
+    candidates' best stands, and the second result tells which answers are certain.
+    """
+    return _search(x, body, surface.vertex_blocks, surface, _squared_to_points, exact)
+
+
+def _triangle_features(corners):
+    return corners  # (faces, 3 corners, 3 components)
+
+
+def nearest_triangle(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
+) -> tuple[Int[Array, verts], Bool[Array, verts]]:
+    """Nearest body triangle of every cloth vertex by exact point-triangle distance; results as in `nearest_vertex`."""
+    return _search(x, body[surface.faces], surface.face_blocks, surface, _squared_to_triangles, exact)
+
+
+# --- distance -------------------------------------------------------------------------------------------------------
+
+
+def plane_distance(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], normals: Float[Array, "body 3"], index: Int[Array, verts]
+) -> Float[Array, verts]:
+    """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
+    return jnp.sum(normals[index] * (x - body[index]), axis=-1)
+
+
+def triangle_distance(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, index: Int[Array, verts]
+) -> Float[Array, verts]:
+    """Exact signed distance in m to the nearest triangle `index`, negative inside.
+
+        d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
+
+    The sign comes from the pseudo-normal of the feature that holds c (face, edge or vertex), which alone is right at
+    edges and vertices. The closest point and n are constants to the derivative, which is exact to first order; on the
+    surface itself n is the pseudo-normal. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
+    """
+    corners = lax.stop_gradient(body)[surface.faces[index]]
+    weights = _closest_weights(lax.stop_gradient(x), corners)
+    moving = body[surface.faces[index]]
+    closest = jnp.sum(weights[..., None] * moving, axis=1)
+    normal = _pseudo_normal(lax.stop_gradient(body), surface, index, weights)
+    away = lax.stop_gradient(x - closest)
+    length = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
+    touching = length < 1e-7  # m: the rounding of a float32 position at 1 m
+    side = jnp.sign(jnp.sum(away * normal, axis=-1, keepdims=True))
+    direction = jnp.where(touching | (side == 0), normal, side * away / jnp.where(touching, 1, length))
+    return jnp.sum(direction * (x - closest), axis=-1)
+
+
+def _closest_weights(x, corners):
+    """Barycentric coordinates (verts, 3) of the closest point of each triangle."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, ac, bc = b - a, c - a, c - b
+    normal = jnp.cross(ab, ac)
+    square = jnp.sum(normal * normal, axis=-1)
+
+    def dot(p, q):
+        return jnp.sum(p * q, axis=-1)
+
+    def ratio(p, q):
+        return jnp.clip(p / jnp.where(q > 0, q, 1), 0, 1)
+
+    wa = dot(jnp.cross(bc, x - b), normal)
+    wb = dot(jnp.cross(-ac, x - c), normal)
+    wc = dot(jnp.cross(ab, x - a), normal)
+    face = jnp.stack([wa, wb, wc], axis=-1) / jnp.where(square > 0, square, 1)[:, None]
+    inside = (square > 0) & jnp.all(face > 0, axis=-1)
+    s, t, u = (
+        ratio(dot(x - a, ab), dot(ab, ab)),
+        ratio(dot(x - b, bc), dot(bc, bc)),
+        ratio(dot(x - c, -ac), dot(ac, ac)),
+    )
+    zero = jnp.zeros_like(s)
+    edges = jnp.stack([jnp.stack(w, axis=-1) for w in ([1 - s, s, zero], [zero, 1 - t, t], [u, zero, 1 - u])], axis=1)
+    gap = x[:, None] - jnp.einsum("vek,vkd->ved", edges, corners, precision="highest")
+    best = jnp.argmin(jnp.sum(gap * gap, axis=-1), axis=1)
+    return jnp.where(inside[:, None], face, jnp.take_along_axis(edges, best[:, None, None], axis=1)[:, 0])
+
+
+def _pseudo_normal(body, surface, index, weights):
+    """Normal of the feature that holds the closest point: face, mean of an edge's two faces, or angle-weighted at a vertex."""
+    normals = jnp.concatenate([face_normals(body, surface.faces), jnp.zeros_like(body[:1])])
+    zero = weights <= 0
+    count = jnp.sum(zero, axis=-1)
+    # the edge opposite corner k lies between corners k+1 and k+2, which is edge k+1 of the face
+    opposite = (jnp.argmax(zero, axis=-1) + 1) % 3
+    edge = jnp.take_along_axis(surface.face_edges[index], opposite[:, None], axis=1)[:, 0]
+    along = jnp.sum(normals[surface.edge_sides[edge]], axis=1)
+    corner = jnp.take_along_axis(surface.faces[index], jnp.argmax(weights, axis=-1)[:, None], axis=1)[:, 0]
+    ring = surface.rings[corner]  # (verts, most)
+    at = jnp.concatenate([surface.faces, jnp.zeros_like(surface.faces[:1])])[ring]
+    here = at == corner[:, None, None]
+    p = body[at]
+    first, second = jnp.roll(p, -1, axis=2), jnp.roll(p, -2, axis=2)
+    angles = jnp.sum(jnp.where(here, angle_between(first - p, second - p), 0), axis=-1)
+    tip = jnp.sum(angles[..., None] * normals[ring], axis=1)
+    chosen = jnp.where((count == 0)[:, None], normals[index], jnp.where((count == 1)[:, None], along, tip))
+    return normalize(chosen)
+
+
+def collision(distance: Float[Array, verts], thickness, stiffness) -> Float[Array, ""]:
+    """Collision energy in J.
+
+        E = k_c sum_v min(d(x_v) - eps, 0)^2
+
+    Args:
+        distance: (verts,) signed distance to the posed body in m. thickness: eps in m. stiffness: k_c in J/m^2 a vertex.
+
+    Zero with zero derivative for cloth farther than eps; continuous in value and first derivative at eps.
+    Source: slides, equation (12).
+    """
+    return stiffness * jnp.sum(jnp.minimum(distance - thickness, 0) ** 2)

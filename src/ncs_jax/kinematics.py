@@ -1,0 +1,136 @@
+"""Skeletons, forward kinematics and linear blend skinning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+__all__ = [
+    "Blend",
+    "Pose",
+    "Skeleton",
+    "blend",
+    "blend_from",
+    "forward",
+    "skin",
+    "to_rest_axes",
+    "transforms",
+    "unpose",
+]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Skeleton:
+    """Rest joints (joints, 3) in m; `parents` is a static tuple with parents[j] < j and -1 at the root."""
+
+    joints: Float[Array, "joints 3"]
+    parents: tuple[int, ...] = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pose:
+    """What a frame of motion does to the joints: world rotations since rest, and world positions in m."""
+
+    rotations: Float[Array, "*frames joints 3 3"]
+    positions: Float[Array, "*frames joints 3"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Blend:
+    """Skinning weights, sparse by column: only the joints that move some vertex are kept; rows sum to 1.
+
+    The blend is then one small matrix product. On a CPU that is ten times faster over a batch than gathering each vertex's own
+    few joints, whose 12 numbers apiece do not stay in registers.
+    """
+
+    weights: Float[Array, "verts used"]
+    joints: tuple[int, ...] = field(metadata={"static": True})
+
+
+def to_rest_axes(
+    rotations: Float[Array, "*frames joints 3 3"], rest_rotations: Float[Array, "joints 3 3"]
+) -> Float[Array, "*frames joints 3 3"]:
+    """Local rotations given in each joint's own rest frame Q_j (Mixamo, glTF), as rotations along the world's axes: Q_j R_j Q_j^T.
+
+    A skeleton without rest rotations (SMPL) needs no such turn; after it, every skeleton is of that kind.
+    """
+    return rest_rotations @ rotations @ jnp.swapaxes(rest_rotations, -1, -2)
+
+
+def forward(
+    skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], translation: Float[Array, "*frames 3"]
+) -> Pose:
+    """Forward kinematics: R_j = R_parent R_local, p_j = p_parent + R_parent (J_j - J_parent).
+
+    Args:
+        skeleton: rest joints and parents. rotations: local rotations since rest. translation: (..., 3) of the root, m.
+
+    Returns:
+        World rotations and joint positions; joints of one depth are computed at once.
+    """
+    parents = np.asarray(skeleton.parents)
+    depth = np.zeros(len(parents), int)
+    for j, parent in enumerate(parents):
+        depth[j] = depth[parent] + 1 if parent >= 0 else 0
+    order = np.argsort(depth, kind="stable")
+    place = np.argsort(order)
+    roots = order[depth[order] == 0]
+    world = rotations[..., roots, :, :]
+    position = jnp.broadcast_to(skeleton.joints[roots], (*world.shape[:-2], 3)) + translation[..., None, :]
+    for level in range(1, int(depth.max(initial=0)) + 1):
+        here = order[depth[order] == level]
+        above = place[parents[here]]
+        turned = world[..., above, :, :]
+        bone = skeleton.joints[here] - skeleton.joints[parents[here]]
+        offset = jnp.einsum("...jab,jb->...ja", turned, bone)
+        position = jnp.concatenate([position, position[..., above, :] + offset], axis=-2)
+        world = jnp.concatenate([world, turned @ rotations[..., here, :, :]], axis=-3)
+    return Pose(world[..., place, :, :], position[..., place, :])
+
+
+def transforms(skeleton: Skeleton, pose: Pose) -> Float[Array, "*frames joints 3 4"]:
+    """Rigid motion [R_j | p_j - R_j J_j] of every joint from rest to pose."""
+    shift = pose.positions - jnp.einsum("...jab,jb->...ja", pose.rotations, skeleton.joints)
+    return jnp.concatenate([pose.rotations, shift[..., None]], axis=-1)
+
+
+def blend_from(dense: np.ndarray, most: int = 8, dtype=jnp.float32) -> Blend:
+    """Keep the `most` largest weights of every row of a dense (verts, joints) table, and the columns that are left."""
+    dense = np.asarray(dense, np.float64)
+    if dense.shape[1] > most:
+        kth = np.partition(dense, -most, axis=1)[:, -most, None]
+        dense = np.where(dense >= kth, dense, 0)
+    dense = dense / dense.sum(axis=1, keepdims=True)
+    used = np.flatnonzero(dense.max(axis=0) > 1e-4)
+    kept = dense[:, used]
+    return Blend(jnp.asarray(kept / kept.sum(axis=1, keepdims=True), dtype), tuple(int(j) for j in used))
+
+
+def blend(matrices: Float[Array, "*frames joints 3 4"], weights: Blend) -> Float[Array, "*frames verts 3 4"]:
+    """Blended transform of every vertex, sum_j w_vj [R_j | t_j]."""
+    used = matrices[..., np.asarray(weights.joints), :, :]
+    flat = used.reshape(*used.shape[:-2], 12)
+    blended = jnp.einsum("vj,...jk->...vk", weights.weights, flat, precision="highest")
+    return blended.reshape(*blended.shape[:-1], 3, 4)
+
+
+def skin(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """Linear blend skinning: unposed positions to posed ones, m."""
+    return jnp.sum(blended[..., :3] * x[:, None, :], axis=-1) + blended[..., 3]
+
+
+def unpose(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """Inverse of `skin`, by the adjugate. Singular only where opposite rotations cancel in the blend; there it returns zeros."""
+    a, b, c = blended[..., 0], blended[..., 1], blended[..., 2]
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
+    determinant = jnp.sum(a * jnp.cross(b, c), axis=-1)
+    singular = jnp.abs(determinant) < 1e-6
+    solution = jnp.sum(rows * (x - blended[..., 3])[:, None, :], axis=-1)
+    return jnp.where(singular[:, None], 0, solution / jnp.where(singular, 1, determinant)[:, None])

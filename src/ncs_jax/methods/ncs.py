@@ -1,0 +1,75 @@
+"""Neural cloth simulation: static and dynamic codes that add, z = z_S + alpha z_D (15), decoded and skinned (16)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.descriptors import DESCRIPTORS
+from ncs_jax.kinematics import Blend
+from ncs_jax.model import Model
+from ncs_jax.motion import Track
+from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+
+__all__ = ["NCS", "garment_blend", "initial_parameters", "static_codes", "window_codes"]
+
+
+@dataclass(frozen=True)
+class NCS:
+    """The three networks; `dynamic` is None for a character that never moves."""
+
+    static: StaticEncoder
+    dynamic: DynamicEncoder | None
+    decoder: Decoder
+    learn_weights: bool = False
+
+
+def initial_parameters(network: NCS, key: Array, model: Model) -> dict:
+    """Fresh parameters: a plain pytree of arrays."""
+    a, b, c = jax.random.split(key, 3)
+    joints, numbers = len(model.inputs), DESCRIPTORS[model.descriptor]
+    code = jnp.zeros(network.static.sizes[-1])
+    params = {
+        "static": network.static.init(a, jnp.zeros((joints, numbers + 3)))["params"],
+        "decoder": network.decoder.init(c, code)["params"],
+    }
+    if network.dynamic is not None:
+        params["dynamic"] = network.dynamic.init(b, jnp.zeros((1, joints, numbers + 6)), code)["params"]
+    if network.learn_weights:
+        params["blend"] = jnp.zeros_like(model.blend.weights)
+    return params
+
+
+def garment_blend(network: NCS, params: dict, model: Model) -> Blend:
+    """The garment's skinning weights: given, or scaled by learned factors w exp(s) / sum, which keep zeros zero."""
+    if not network.learn_weights:
+        return model.blend
+    scaled = model.blend.weights * jnp.exp(params["blend"])
+    return Blend(scaled / jnp.sum(scaled, axis=-1, keepdims=True), model.blend.joints)
+
+
+def static_codes(network: NCS, params: dict, descriptors: Float[Array, "*frames joints numbers"]):
+    """z_S of single frames."""
+    return network.static.apply({"params": params["static"]}, descriptors)
+
+
+def window_codes(
+    network: NCS, params: dict, track: Track, ends: Int[Array, batch], length: int, last: int
+) -> tuple[Float[Array, "last batch code"], Float[Array, "last batch code"] | None]:
+    """Codes z_S and z_D of the `last` frames of windows of `length` frames that end at `ends`, time leading.
+
+    Frames before a motion's start are rest: zero dynamic descriptors.
+    """
+    start = track.start[ends]
+    back = ends - jnp.arange(length - 1, -1, -1)[:, None]
+    inside = jnp.maximum(back, start)
+    z_static = static_codes(network, params, track.static[inside[length - last :]])
+    if network.dynamic is None:
+        return z_static, None
+    moving = track.dynamic[inside] * (back >= start)[..., None, None]
+    rest = jnp.zeros((ends.shape[0], network.dynamic.state), moving.dtype)
+    z_dynamic = network.dynamic.apply({"params": params["dynamic"]}, moving, rest)
+    return z_static, z_dynamic[length - last :]

@@ -1,0 +1,83 @@
+"""A motion as the network and the energies read it: computed once, frame by frame, and then only looked up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ncs_jax import descriptors
+from ncs_jax.descriptors import Joints
+from ncs_jax.kinematics import forward, transforms
+from ncs_jax.model import Model
+
+__all__ = ["Track", "input_joints", "join", "mirror", "track"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Track:
+    """Motions laid end to end. `start` is the first frame of the motion that a frame belongs to.
+
+    Before its first frame a character is taken to have stood there at rest.
+    """
+
+    static: Float[Array, "frames joints numbers"]
+    dynamic: Float[Array, "frames joints rates"]
+    matrices: Float[Array, "frames all 3 4"]
+    start: Int[Array, frames]
+
+
+def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joints:
+    """The joints that the network reads."""
+    inputs = np.asarray(model.inputs)
+    return Joints(local[inputs], pose.rotations[inputs], pose.positions[inputs])
+
+
+def track(model: Model, local: Float[Array, "frames joints 3 3"], translation: Float[Array, "frames 3"]) -> Track:
+    """Descriptors and joint transforms of a motion sampled at the model's frame rate.
+
+    Args:
+        local: local rotations of the model's joints since rest. translation: of the root, m.
+    """
+    frames = local.shape[0]
+
+    @jax.jit
+    def run(model, local, translation):
+        pose = forward(model.skeleton, local, translation)
+        joints = jax.vmap(lambda r, p: input_joints(model, r, p))(local, pose)
+        earlier = [jnp.maximum(jnp.arange(frames) - k, 0) for k in (1, 2)]
+        previous, before = (jax.tree.map(lambda a, k=k: a[k], joints) for k in earlier)
+        g = model.material.gravity
+        static = jax.vmap(lambda j: descriptors.static(j, g, model.descriptor))(joints)
+        dynamic = jax.vmap(lambda j, p, b: descriptors.dynamic(j, p, b, g, 1 / model.fps, model.descriptor))(
+            joints, previous, before
+        )
+        return static, dynamic, transforms(model.skeleton, pose)
+
+    return Track(*run(model, local, translation), start=jnp.zeros(frames, jnp.int32))
+
+
+def join(tracks: list[Track]) -> Track:
+    """Several motions as one track."""
+    offsets = np.cumsum([0] + [t.start.shape[0] for t in tracks[:-1]])
+    moved = [Track(t.static, t.dynamic, t.matrices, t.start + int(o)) for t, o in zip(tracks, offsets, strict=True)]
+    return jax.tree.map(lambda *a: jnp.concatenate(a), *moved)
+
+
+def mirror(
+    poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The motion in a mirror across the character's middle: a new one, the given one is left as it is.
+
+    Args:
+        poses: (frames, joints, 3) axis-angle. translation: (frames, 3) m. partner: (joints,) the joint on the other side, or
+            itself. axis: the axis from left to right. An axis-angle vector is a pseudovector: its component along the mirror's
+            normal keeps its sign and the others change theirs.
+    """
+    sign = -np.ones(3, poses.dtype)
+    sign[axis] = 1
+    return poses[:, partner] * sign, translation * -sign

@@ -1,0 +1,101 @@
+"""The network: static encoder, bias-free recurrent dynamic encoder, decoder; equations (6), (7), (15) and (16)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder"]
+
+
+class StaticEncoder(nn.Module):
+    """z_S from the static descriptors of one frame: a multilayer perceptron."""
+
+    sizes: Sequence[int] = (64, 128, 256, 512)
+
+    @nn.compact
+    def __call__(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch code"]:
+        """Code of `(..., joints, numbers)` descriptors; each frame by itself."""
+        h = descriptor.reshape(*descriptor.shape[:-2], -1)
+        for i, size in enumerate(self.sizes):
+            h = nn.relu(nn.Dense(size, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")(h))
+        return h
+
+
+class DynamicEncoder(nn.Module):
+    """z_D from the dynamic descriptors of a sequence: no bias anywhere, so no motion gives exactly zero.
+
+    Every layer maps zero to zero, and a gated recurrent unit without bias halves its state when its input is zero: z_D decays
+    to zero when the motion stops. The gates' reset-before-product form is Cho et al. 2014.
+    """
+
+    joint_sizes: Sequence[int] = (32, 32)
+    sizes: Sequence[int] = (512, 512)
+    state: int = 512
+
+    def setup(self):
+        """Create the layers."""
+        he = nn.initializers.he_normal()
+        self.per_joint = [nn.Dense(n, use_bias=False, kernel_init=he) for n in self.joint_sizes]
+        self.joined = [nn.Dense(n, use_bias=False, kernel_init=he) for n in self.sizes]
+        self.gates_in = nn.Dense(3 * self.state, use_bias=False)
+        self.recurrent = self.param("recurrent", nn.initializers.orthogonal(), (self.state, 3 * self.state))
+
+    def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch gates"]:
+        """What the recurrence reads, frame by frame: everything that needs no state."""
+        h = descriptor
+        for layer in self.per_joint:
+            h = nn.relu(layer(h))
+        h = h.reshape(*h.shape[:-2], -1)
+        for layer in self.joined:
+            h = nn.relu(layer(h))
+        return self.gates_in(h)
+
+    def step(
+        self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]
+    ) -> Float[Array, "*batch code"]:
+        """One step of the gated recurrent unit."""
+        n = self.state
+        reset_update = nn.sigmoid(features[..., : 2 * n] + state @ self.recurrent[:, : 2 * n])
+        reset, update = reset_update[..., :n], reset_update[..., n:]
+        candidate = jnp.tanh(features[..., 2 * n :] + (reset * state) @ self.recurrent[:, 2 * n :])
+        return update * state + (1 - update) * candidate
+
+    def __call__(
+        self, descriptors: Float[Array, "frames *batch joints numbers"], state: Float[Array, "*batch code"]
+    ) -> Float[Array, "frames *batch code"]:
+        """Codes of a sequence, time leading, from a state; `lax.scan` over frames."""
+        features = self.features(descriptors)
+        if self.is_initializing():
+            return self.step(state, features[0])[None]
+
+        def step(h, f):
+            h = self.step(h, f)
+            return h, h
+
+        return jax.lax.scan(step, state, features)[1]
+
+
+class Decoder(nn.Module):
+    """Vertex offsets in unposed space from a code: a perceptron and a linear map, (6) and (7).
+
+    The last map works in units of `scale` (m), so that one optimiser step of 1e-3 moves vertices by millimetres and not by
+    decimetres.
+    """
+
+    verts: int
+    sizes: Sequence[int] = (512, 512, 512)
+    scale: float = 0.02
+
+    @nn.compact
+    def __call__(self, code: Float[Array, "*batch code"]) -> Float[Array, "*batch verts 3"]:
+        """Offsets (..., verts, 3) in m to add to the rest garment."""
+        h = code
+        for i, size in enumerate(self.sizes):
+            h = nn.relu(nn.Dense(size, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")(h))
+        last = nn.Dense(3 * self.verts, kernel_init=nn.initializers.normal(0.3 / h.shape[-1] ** 0.5), name="offsets")
+        return self.scale * last(h).reshape(*h.shape[:-1], self.verts, 3)

@@ -1,0 +1,147 @@
+"""The total energy (10): the one place that knows every term, and the one place that stops a gradient in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.energies.baraff_witkin import baraff_witkin
+from ncs_jax.energies.bending import bending
+from ncs_jax.energies.collision import (
+    Surface,
+    collision,
+    nearest_triangle,
+    nearest_vertex,
+    plane_distance,
+    triangle_distance,
+    vertex_normals,
+)
+from ncs_jax.energies.gravity import gravity
+from ncs_jax.energies.inertia import inertia, project
+from ncs_jax.energies.mass_spring import mass_spring
+from ncs_jax.energies.neo_hookean import neo_hookean
+from ncs_jax.energies.pinning import pinning
+from ncs_jax.energies.stvk import stvk
+from ncs_jax.kinematics import unpose
+from ncs_jax.mesh import Mesh
+
+__all__ = ["MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "total"]
+
+MEMBRANES = {
+    "stvk": (stvk, ("lam", "mu")),
+    "neo_hookean": (neo_hookean, ("lam", "mu")),
+    "baraff_witkin": (baraff_witkin, ("stretch", "shear")),
+    "mass_spring": (mass_spring, ("stiffness",)),
+}
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Which terms a scene has. What is not named here is not traced."""
+
+    membrane: str | None = "stvk"
+    bending: bool = True
+    collision: str | None = "plane"  # "plane", "triangle" or None
+    exact: bool = True  # exact search; otherwise candidates alone
+    gravity: bool = True
+    inertia: bool = True
+    pinning: bool = False
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Material:
+    """The numbers of the energies, in SI units; any of them may be differentiated or batched."""
+
+    density: Float[Array, ""]  # kg/m^2
+    membrane: tuple[Float[Array, ""], ...]  # in the order of MEMBRANES
+    bending: Float[Array, ""]  # N m
+    collision: Float[Array, ""]  # J/m^2 a vertex
+    thickness: Float[Array, ""]  # m
+    pinning: Float[Array, ""]  # N/m
+    gravity: Float[Array, 3]  # m/s^2
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Garment:
+    """What a garment is to the energies: its mesh, and which vertices are pinned."""
+
+    mesh: Mesh
+    pins: Int[Array, pins]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Frame:
+    """What one frame brings to the energies; `None` where no term asks for it."""
+
+    dt: float | Float[Array, ""] = field(default=1 / 30)  # s
+    previous: Float[Array, "verts 3"] | None = None  # x_{t-1}
+    before: Float[Array, "verts 3"] | None = None  # x_{t-2}
+    body: Float[Array, "body 3"] | None = None  # posed
+    blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
+
+
+def distances(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms
+) -> Float[Array, verts]:
+    """Signed distance to the posed body in m by the scene's query."""
+    if terms.collision == "triangle":
+        index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
+        return triangle_distance(x, body, surface, index)
+    index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
+    return plane_distance(x, body, vertex_normals(body, surface), index)
+
+
+def energies(
+    x: Float[Array, "verts 3"],
+    garment: Garment,
+    material: Material,
+    frame: Frame,
+    terms: Terms,
+    surface: Surface | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """Every term of the total energy (10) by name, in J.
+
+    Args:
+        x: (verts, 3) positions in m. garment, material: what is constant. frame: what this frame brings.
+        terms: which terms exist. surface: the touchable body, where there is collision.
+
+    The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler.
+    """
+    mesh = garment.mesh
+    mass = material.density * mesh.vertex_area
+    parts = {}
+    if terms.membrane is not None:
+        with jax.named_scope("membrane"):
+            parts["membrane"] = MEMBRANES[terms.membrane][0](x, mesh, *material.membrane)
+    if terms.bending:
+        with jax.named_scope("bending"):
+            parts["bending"] = bending(x, mesh, material.bending)
+    if terms.collision is not None:
+        with jax.named_scope("collision"):
+            parts["collision"] = collision(
+                distances(x, frame.body, surface, terms), material.thickness, material.collision
+            )
+    if terms.gravity:
+        with jax.named_scope("gravity"):
+            parts["gravity"] = gravity(x, mass, material.gravity)
+    if terms.inertia:
+        with jax.named_scope("inertia"):
+            target = lax.stop_gradient(project(frame.previous, frame.before))
+            parts["inertia"] = inertia(x, target, mass, frame.dt)
+    if terms.pinning:
+        with jax.named_scope("pinning"):
+            pins = garment.pins
+            parts["pinning"] = pinning(unpose(frame.blended[pins], x[pins]), mesh.rest[pins], material.pinning)
+    return parts
+
+
+def total(*arguments, **options) -> Float[Array, ""]:
+    """Total energy (10) in J: the sum of `energies`, called alike."""
+    return sum(energies(*arguments, **options).values(), start=jnp.zeros(()))
