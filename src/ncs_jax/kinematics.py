@@ -57,16 +57,14 @@ class Blend:
 def to_rest_axes(
     rotations: Float[Array, "*frames joints 3 3"], rest_rotations: Float[Array, "joints 3 3"]
 ) -> Float[Array, "*frames joints 3 3"]:
-    """Local rotations given in each joint's own rest frame Q_j (Mixamo, glTF), as rotations along the world's axes: Q_j R_j Q_j^T.
+    """Local rotations given in each joint's own rest frame Q_j (Mixamo, glTF), as ones along the world's axes: Q_j R_j Q_j^T.
 
     A skeleton without rest rotations (SMPL) needs no such turn; after it, every skeleton is of that kind.
     """
     return rest_rotations @ rotations @ jnp.swapaxes(rest_rotations, -1, -2)
 
 
-def forward(
-    skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], translation: Float[Array, "*frames 3"]
-) -> Pose:
+def forward(skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], translation: Float[Array, "*frames 3"]) -> Pose:
     """Forward kinematics: R_j = R_parent R_local, p_j = p_parent + R_parent (J_j - J_parent).
 
     Args:
@@ -127,7 +125,7 @@ def skin(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Floa
 
 
 def unpose(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
-    """Inverse of `skin`, by the adjugate. Singular only where opposite rotations cancel in the blend; there it returns zeros."""
+    """Inverse of `skin`, by the adjugate. Singular only where opposite rotations cancel in the blend; zeros there."""
     a, b, c = blended[..., 0], blended[..., 1], blended[..., 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
     determinant = jnp.sum(a * jnp.cross(b, c), axis=-1)

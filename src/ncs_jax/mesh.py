@@ -26,13 +26,13 @@ class Mesh:
     faces: Int[Array, "faces 3"]
     edges: Int[Array, "edges 2"]
     hinges: Int[Array, "hinges 4"]
-    face_area: Float[Array, faces]
+    face_area: Float[Array, "faces"]
     face_axes: Float[Array, "faces 2 2"]  # inverse of the rest edges (e1, e2) in the face's material axes (u, v), 1/m
-    vertex_area: Float[Array, verts]  # a third of the adjacent faces
-    edge_length: Float[Array, edges]
-    edge_weight: Float[Array, edges]  # 1 inside an equilateral mesh, 1/2 on its border
-    hinge_angle: Float[Array, hinges]
-    hinge_length: Float[Array, hinges]
+    vertex_area: Float[Array, "verts"]  # a third of the adjacent faces
+    edge_length: Float[Array, "edges"]
+    edge_weight: Float[Array, "edges"]  # 1 inside an equilateral mesh, 1/2 on its border
+    hinge_angle: Float[Array, "hinges"]
+    hinge_length: Float[Array, "hinges"]
     hinge_area: Float[Array, "hinges 2"]
 
 

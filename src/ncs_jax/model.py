@@ -21,7 +21,7 @@ __all__ = ["Model", "pose_body", "smooth_weights", "touchable", "transfer_weight
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Model:
-    """Constants of a scene. The skeleton holds only the joints that matter; `source_joints` says which of the motion's they are.
+    """Constants of a scene. The skeleton holds only the joints that matter, the `source_joints` of the motion's.
 
     `inputs` are the joints that the network reads, the root first. `body` and its `surface` are the part of the body that the
     garment can touch, `None` in a scene without a body or without collision.
@@ -49,7 +49,7 @@ def pose_body(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array
 
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Skinning weights (verts, joints) of each garment vertex from the nearest point of the body's **surface**, interpolated."""
+    """Skinning weights (verts, joints) of each garment vertex, interpolated at the nearest point of the body's **surface**."""
     from ncs_jax.energies.collision import _closest_weights, nearest_triangle
 
     surface = surface_from(garment, body, faces)

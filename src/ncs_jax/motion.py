@@ -28,7 +28,7 @@ class Track:
     static: Float[Array, "frames joints numbers"]
     dynamic: Float[Array, "frames joints rates"]
     matrices: Float[Array, "frames all 3 4"]
-    start: Int[Array, frames]
+    start: Int[Array, "frames"]
 
 
 def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joints:
@@ -68,9 +68,7 @@ def join(tracks: list[Track]) -> Track:
     return jax.tree.map(lambda *a: jnp.concatenate(a), *moved)
 
 
-def mirror(
-    poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def mirror(poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """The motion in a mirror across the character's middle: a new one, the given one is left as it is.
 
     Args:

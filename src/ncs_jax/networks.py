@@ -55,9 +55,7 @@ class DynamicEncoder(nn.Module):
             h = nn.relu(layer(h))
         return self.gates_in(h)
 
-    def step(
-        self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]
-    ) -> Float[Array, "*batch code"]:
+    def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]) -> Float[Array, "*batch code"]:
         """One step of the gated recurrent unit."""
         n = self.state
         reset_update = nn.sigmoid(features[..., : 2 * n] + state @ self.recurrent[:, : 2 * n])

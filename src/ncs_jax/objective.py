@@ -72,7 +72,7 @@ class Garment:
     """What a garment is to the energies: its mesh, and which vertices are pinned."""
 
     mesh: Mesh
-    pins: Int[Array, pins]
+    pins: Int[Array, "pins"]
 
 
 @jax.tree_util.register_dataclass
@@ -89,7 +89,7 @@ class Frame:
 
 def distances(
     x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms
-) -> Float[Array, verts]:
+) -> Float[Array, "verts"]:
     """Signed distance to the posed body in m by the scene's query."""
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
@@ -125,9 +125,7 @@ def energies(
             parts["bending"] = bending(x, mesh, material.bending)
     if terms.collision is not None:
         with jax.named_scope("collision"):
-            parts["collision"] = collision(
-                distances(x, frame.body, surface, terms), material.thickness, material.collision
-            )
+            parts["collision"] = collision(distances(x, frame.body, surface, terms), material.thickness, material.collision)
     if terms.gravity:
         with jax.named_scope("gravity"):
             parts["gravity"] = gravity(x, mass, material.gravity)

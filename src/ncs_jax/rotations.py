@@ -80,9 +80,7 @@ def matrix_to_six(r: Float[Array, "*rows 3 3"]) -> Float[Array, "*rows 6"]:
     return jnp.concatenate([r[..., :, 0], r[..., :, 1]], axis=-1)
 
 
-def slerp(
-    p: Float[Array, "*rows 4"], q: Float[Array, "*rows 4"], t: Float[Array, "*rows"] | float
-) -> Float[Array, "*rows 4"]:
+def slerp(p: Float[Array, "*rows 4"], q: Float[Array, "*rows 4"], t: Float[Array, "*rows"] | float) -> Float[Array, "*rows 4"]:
     """Interpolate two unit quaternions along the **shorter** arc: q and -q are one rotation, so q is first taken from p's
     hemisphere."""
     dot = jnp.sum(p * q, axis=-1, keepdims=True)

@@ -44,7 +44,7 @@ class Surface:
     face_edges: Int[Array, "faces 3"]
     edge_sides: Int[Array, "edges 2"]
     cloth_blocks: Int[Array, "blocks size"]
-    cloth_place: Int[Array, verts]
+    cloth_place: Int[Array, "verts"]
     vertex_blocks: Int[Array, "clusters vertices"]
     face_blocks: Int[Array, "groups triangles"]
     groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
@@ -216,7 +216,7 @@ def _search(x, features, blocks, surface, squared, exact):
 
 def nearest_vertex(
     x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
-) -> tuple[Int[Array, verts], Bool[Array, verts]]:
+) -> tuple[Int[Array, "verts"], Bool[Array, "verts"]]:
     """Nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
 
     With `exact` the rest is searched in full, so the answer is that of a full search whatever the pose; without it the
@@ -231,7 +231,7 @@ def _triangle_features(corners):
 
 def nearest_triangle(
     x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
-) -> tuple[Int[Array, verts], Bool[Array, verts]]:
+) -> tuple[Int[Array, "verts"], Bool[Array, "verts"]]:
     """Nearest body triangle of every cloth vertex by exact point-triangle distance; results as in `nearest_vertex`."""
     return _search(x, body[surface.faces], surface.face_blocks, surface, _squared_to_triangles, exact)
 
@@ -240,15 +240,15 @@ def nearest_triangle(
 
 
 def plane_distance(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], normals: Float[Array, "body 3"], index: Int[Array, verts]
-) -> Float[Array, verts]:
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], normals: Float[Array, "body 3"], index: Int[Array, "verts"]
+) -> Float[Array, "verts"]:
     """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
     return jnp.sum(normals[index] * (x - body[index]), axis=-1)
 
 
 def triangle_distance(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, index: Int[Array, verts]
-) -> Float[Array, verts]:
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, index: Int[Array, "verts"]
+) -> Float[Array, "verts"]:
     """Exact signed distance in m to the nearest triangle `index`, negative inside.
 
         d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
@@ -321,7 +321,7 @@ def _pseudo_normal(body, surface, index, weights):
     return normalize(chosen)
 
 
-def collision(distance: Float[Array, verts], thickness, stiffness) -> Float[Array, ""]:
+def collision(distance: Float[Array, "verts"], thickness, stiffness) -> Float[Array, ""]:
     """Collision energy in J.
 
         E = k_c sum_v min(d(x_v) - eps, 0)^2

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 __all__ = ["gravity"]
 
 
-def gravity(x: Float[Array, "verts 3"], mass: Float[Array, verts], acceleration: Float[Array, 3]) -> Float[Array, ""]:
+def gravity(x: Float[Array, "verts 3"], mass: Float[Array, "verts"], acceleration: Float[Array, 3]) -> Float[Array, ""]:
     """Potential energy in a uniform field in J: E = - sum_v m x . g.
 
     Args:

@@ -8,16 +8,12 @@ from jaxtyping import Array, Float
 __all__ = ["inertia", "project"]
 
 
-def project(
-    previous: Float[Array, "verts 3"], before: Float[Array, "verts 3"], ratio: float = 1.0
-) -> Float[Array, "verts 3"]:
+def project(previous: Float[Array, "verts 3"], before: Float[Array, "verts 3"], ratio: float = 1.0) -> Float[Array, "verts 3"]:
     """Where the vertices go without forces: x_proj = x_{t-1} + (x_{t-1} - x_{t-2}) * ratio, with ratio = dt_t / dt_{t-1}."""
     return previous + (previous - before) * ratio
 
 
-def inertia(
-    x: Float[Array, "verts 3"], target: Float[Array, "verts 3"], mass: Float[Array, verts], dt
-) -> Float[Array, ""]:
+def inertia(x: Float[Array, "verts 3"], target: Float[Array, "verts 3"], mass: Float[Array, "verts"], dt) -> Float[Array, ""]:
     """Inertia potential in J, whose minimiser together with the other energies is a step of implicit Euler.
 
         E = 1 / (2 dt^2) sum_v m |x_t - x_proj|^2

@@ -57,7 +57,7 @@ def static_codes(network: NCS, params: dict, descriptors: Float[Array, "*frames 
 
 
 def window_codes(
-    network: NCS, params: dict, track: Track, ends: Int[Array, batch], length: int, last: int
+    network: NCS, params: dict, track: Track, ends: Int[Array, "batch"], length: int, last: int
 ) -> tuple[Float[Array, "last batch code"], Float[Array, "last batch code"] | None]:
     """Codes z_S and z_D of the `last` frames of windows of `length` frames that end at `ends`, time leading.
 
