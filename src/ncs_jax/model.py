@@ -32,6 +32,7 @@ class Model:
     garment: Garment
     blend: Blend
     material: Material
+    basis: Float[Array, "verts modes"]  # smooth modes that the decoder works with, m
     body: Float[Array, "body 3"] | None
     body_blend: Blend | None
     surface: Surface | None

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder"]
+__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge"]
 
 
 class StaticEncoder(nn.Module):
@@ -81,19 +81,47 @@ class DynamicEncoder(nn.Module):
 class Decoder(nn.Module):
     """Vertex offsets in unposed space from a code: a perceptron and a linear map, (6) and (7).
 
-    The last map works in units of `scale` (m), so that one optimiser step of 1e-3 moves vertices by millimetres and not by
-    decimetres.
+    The linear map has two parts that add: one moves each vertex by itself, in units of `local` (m); the other moves the smooth
+    modes of the garment (see `modes`), so that drape and swing, soft and global, are learned as readily as strain, stiff and
+    local. Together they are one linear map, see `merge`. The units are such that an optimiser step of 1e-3 moves vertices by
+    about a millimetre, not by decimetres.
     """
 
     verts: int
     sizes: Sequence[int] = (512, 512, 512)
-    scale: float = 0.02
+    modes: int = 128
+    local: float = 0.005
 
-    @nn.compact
-    def __call__(self, code: Float[Array, "*batch code"]) -> Float[Array, "*batch verts 3"]:
+    def setup(self):
+        """Create the layers."""
+        he = nn.initializers.he_normal()
+        self.layers = [nn.Dense(n, kernel_init=he) for n in self.sizes]
+        self.offsets = nn.Dense(3 * self.verts, kernel_init=nn.initializers.normal(0.3 / self.sizes[-1] ** 0.5))
+        if self.modes:
+            self.coefficients = nn.Dense(3 * self.modes, kernel_init=nn.initializers.zeros)
+
+    def __call__(self, code: Float[Array, "*batch code"], basis: Float[Array, "verts modes"]) -> Float[Array, "*batch verts 3"]:
         """Offsets (..., verts, 3) in m to add to the rest garment."""
         h = code
-        for i, size in enumerate(self.sizes):
-            h = nn.relu(nn.Dense(size, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")(h))
-        last = nn.Dense(3 * self.verts, kernel_init=nn.initializers.normal(0.3 / h.shape[-1] ** 0.5), name="offsets")
-        return self.scale * last(h).reshape(*h.shape[:-1], self.verts, 3)
+        for layer in self.layers:
+            h = nn.relu(layer(h))
+        offsets = self.local * self.offsets(h).reshape(*h.shape[:-1], self.verts, 3)
+        if self.modes:
+            c = self.coefficients(h).reshape(*h.shape[:-1], self.modes, 3)
+            offsets = offsets + jnp.einsum("vm,...mk->...vk", basis, c)
+        return offsets
+
+
+def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) -> tuple[Decoder, dict]:
+    """The same decoder with one linear map, for inference."""
+    if not decoder.modes:
+        return decoder, params
+    local, modal = params["offsets"], params["coefficients"]
+
+    def whole(a, c):
+        modal_part = jnp.einsum("vm,...mk->...vk", basis, c.reshape(*c.shape[:-1], decoder.modes, 3), precision="highest")
+        return decoder.local * a + modal_part.reshape(a.shape)
+
+    offsets = {name: whole(local[name], modal[name]) for name in ("kernel", "bias")}
+    kept = {name: value for name, value in params.items() if name != "coefficients"}
+    return Decoder(decoder.verts, decoder.sizes, 0, 1.0), {**kept, "offsets": offsets}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,9 @@ from ncs_jax.descriptors import DESCRIPTORS
 from ncs_jax.kinematics import Blend
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder, merge
 
-__all__ = ["NCS", "garment_blend", "initial_parameters", "static_codes", "window_codes"]
+__all__ = ["NCS", "decode", "for_inference", "garment_blend", "initial_parameters", "static_codes", "window_codes"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def initial_parameters(network: NCS, key: Array, model: Model) -> dict:
     code = jnp.zeros(network.static.sizes[-1])
     params = {
         "static": network.static.init(a, jnp.zeros((joints, numbers + 3)))["params"],
-        "decoder": network.decoder.init(c, code)["params"],
+        "decoder": network.decoder.init(c, code, model.basis)["params"],
     }
     if network.dynamic is not None:
         params["dynamic"] = network.dynamic.init(b, jnp.zeros((1, joints, numbers + 6)), code)["params"]
@@ -54,6 +54,17 @@ def garment_blend(network: NCS, params: dict, model: Model) -> Blend:
 def static_codes(network: NCS, params: dict, descriptors: Float[Array, "*frames joints numbers"]):
     """z_S of single frames."""
     return network.static.apply({"params": params["static"]}, descriptors)
+
+
+def decode(network: NCS, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "*frames verts 3"]:
+    """Offsets in unposed space, m."""
+    return network.decoder.apply({"params": params["decoder"]}, code, model.basis)
+
+
+def for_inference(network: NCS, params: dict, model: Model) -> tuple[NCS, dict]:
+    """The same network with the decoder's two linear maps made one."""
+    decoder, decoder_params = merge(network.decoder, params["decoder"], model.basis)
+    return replace(network, decoder=decoder), {**params, "decoder": decoder_params}
 
 
 def window_codes(

@@ -1,0 +1,312 @@
+"""From a validated scene to the constants and motions that run: reads the files, checks that they fit, chooses what matters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.energies.collision import surface_from
+from ncs_jax.errors import InputError
+from ncs_jax.kinematics import Skeleton, blend_from
+from ncs_jax.mesh import mesh_from
+from ncs_jax.methods.ncs import NCS
+from ncs_jax.model import Model, local_rotations, smooth_weights, touchable, transfer_weights, used_joints
+from ncs_jax.modes import modal_basis
+from ncs_jax.motion import Track, join, mirror, track
+from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
+from ncs_jax.rotations import axis_angle_to_matrix, resample
+from ncs_jax.scene import Scene
+
+__all__ = ["Assembly", "assemble", "load_motion", "mirror_partners", "track_of"]
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A scene made ready. `body` and `garment` are the records as read; `train` and `validation` are tracks by motion name."""
+
+    scene: Scene
+    model: Model
+    network: NCS
+    body: io.BodyRecord | None
+    garment: io.GarmentRecord
+    train: dict[str, Track]
+    validation: dict[str, Track]
+
+    @property
+    def track(self) -> Track:
+        """All training motions end to end."""
+        return join(list(self.train.values()))
+
+
+def _read_body(scene: Scene) -> io.BodyRecord | None:
+    return None if scene.body.file in ("", "none") else io.read_body(scene.path(scene.body.file))
+
+
+def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
+    """A motion at the scene's frame rate, checked against the body's skeleton."""
+    path = scene.path(name)
+    record = io.read_motion(path)
+    joints = 1 if body is None else len(body.parents)
+    poses = record.poses
+    if poses.shape[1] != joints:
+        raise InputError(
+            f"{joints} joints expected, as the body has", file=path, field="poses", value=f"{poses.shape[1]} joints",
+            mend="give a motion of this skeleton",
+        )  # fmt: skip
+    if body is not None and body.joint_names and record.joint_names and record.joint_names != body.joint_names:
+        order = {n: i for i, n in enumerate(record.joint_names)}
+        missing = [n for n in body.joint_names if n not in order]
+        if missing:
+            raise InputError("joint missing that the body has", file=path, field="joint_names", value=missing[0])
+        poses = poses[:, [order[n] for n in body.joint_names]]
+    speed = np.abs(np.diff(record.translation, axis=0)).max(initial=0) * record.fps
+    if speed > 100:
+        raise InputError(
+            "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
+            mend="divide centimetres by 100",
+        )  # fmt: skip
+    poses, translation = resample(
+        jnp.asarray(poses, jnp.float32), jnp.asarray(record.translation, jnp.float32), record.fps, scene.motion.fps
+    )
+    return io.MotionRecord(np.asarray(poses), np.asarray(translation), scene.motion.fps, record.joint_names)
+
+
+def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
+    """The joint on the other side of each joint: by names (left/right, L_/R_), else by mirrored rest positions (x to -x)."""
+    if names:
+        lower = [n.lower() for n in names]
+        place = {n: i for i, n in enumerate(lower)}
+
+        def other(n):
+            for a, b in (("left", "right"), ("l_", "r_"), ("lthumb", "rthumb"), ("lhip", "rhip")):
+                for x, y in ((a, b), (b, a)):
+                    if n.startswith(x) or (len(x) > 2 and x in n):
+                        return n.replace(x, y, 1)
+            return n
+
+        return np.array([place.get(other(n), i) for i, n in enumerate(lower)])
+    mirrored = joints * [-1, 1, 1]
+    return np.linalg.norm(joints[None] - mirrored[:, None], axis=-1).argmin(axis=1)
+
+
+def _check_fit(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
+    file = scene.path(scene.garment.file)
+    size, tall = np.ptp(garment.vertices, axis=0).max(), np.ptp(body.vertices, axis=0).max()
+    if not 0.3 < tall < 5:
+        raise InputError(
+            "a body in metres expected, 0.3 to 5 m tall", file=scene.path(scene.body.file), field="vertices",
+            value=f"{tall:.3g} m", mend="scale it to metres",
+        )  # fmt: skip
+    if size > 3 * tall or size < tall / 30:
+        raise InputError(
+            f"a garment about the size of the body ({tall:.2f} m) expected", file=file, field="vertices",
+            value=f"{size:.3g} m", mend="scale it to metres (centimetres: divide by 100)",
+        )  # fmt: skip
+    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    gap = np.maximum(garment.vertices.min(axis=0) - high, low - garment.vertices.max(axis=0))
+    if gap.max() > 0:
+        raise InputError(
+            "a garment that is on the body expected", file=file, field="vertices", value=f"{gap.max():.2f} m apart",
+            mend="move it into the body's coordinates, or turn its axes to Y up",
+        )  # fmt: skip
+
+
+def _inputs(scene: Scene, body: io.BodyRecord, wanted: tuple[int, ...]) -> tuple[int, ...]:
+    if not scene.body.joints:
+        return wanted
+    names = {n: i for i, n in enumerate(body.joint_names)}
+    chosen = []
+    for i, name in enumerate(scene.body.joints):
+        number = names.get(name, int(name) if name.isdigit() else -1)
+        if not 0 <= number < len(body.parents):
+            known = ", ".join(names) if names else f"numbers 0 to {len(body.parents) - 1}"
+            raise InputError(
+                "no such joint", file=scene.source, field=f"body.joints[{i}]", value=name, mend=f"known here: {known}"
+            )
+        chosen.append(number)
+    root = int(np.flatnonzero(body.parents < 0)[0])
+    return (root, *sorted(set(chosen) - {root}))
+
+
+def assemble(scene: Scene, *, motions: bool = True, moves: bool | None = None, dtype=jnp.float32) -> Assembly:
+    """Read every file of a scene, check that they fit together, and precompute all that does not change.
+
+    Args:
+        scene: from `load_scene`. motions: False leaves the motions unread (to animate a trained garment).
+        dtype: of everything; float64 needs JAX's x64 mode.
+
+    Raises:
+        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+    """
+    body, garment = _read_body(scene), io.read_garment(scene.path(scene.garment.file))
+    if body is not None:
+        _check_fit(scene, garment, body)
+    physics = scene.physics
+    collides = body is not None and physics.collision.stiffness > 0
+    names = (*(scene.motion.files if motions else ()), *(scene.motion.validation if motions else ()))
+    records = {name: load_motion(scene, name, body) for name in dict.fromkeys(names)}
+    train_names = scene.motion.files if motions else ()
+    if moves is None:
+        still = [np.all(r.poses == r.poses[:1]) and np.all(r.translation == r.translation[:1]) for r in records.values()]
+        moves = not all(still)
+    pins = _pins(scene, garment)
+    mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
+
+    if body is None:
+        parents, joints, rest_rotations = np.array([-1]), np.zeros((1, 3)), None
+        weights, part = np.ones((len(garment.vertices), 1)), np.zeros(0, int)
+    else:
+        parents, joints, rest_rotations = np.asarray(body.parents), body.joints, body.rest_rotations
+        weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+        weights = smooth_weights(weights, np.asarray(mesh.edges), scene.garment.smoothing)
+        part = (
+            _part(scene, body, garment, parents, weights, [records[n] for n in train_names]) if collides else np.zeros(0, int)
+        )
+    relevant = np.concatenate([weights, body.weights[part]]) if collides else weights
+    inputs = used_joints(parents.tolist(), relevant)
+    if body is not None:
+        inputs = _inputs(scene, body, inputs)
+    skinning = used_joints(parents.tolist(), relevant, least=1e-4)
+    kept = tuple(sorted(set(skinning) | set(_closure(inputs, parents))))
+    place = {j: i for i, j in enumerate(kept)}
+    columns = np.asarray(kept)
+    skeleton = Skeleton(
+        jnp.asarray(joints[columns], dtype), tuple(place[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
+    )
+    surface = body_points = body_blend = None
+    if collides:
+        faces, body_points = _submesh(body.faces, part, len(body.vertices)), body.vertices[part]
+        surface = surface_from(garment.vertices, body_points, faces)
+        body_blend = blend_from(body.weights[part][:, columns], dtype=dtype)
+        body_points = jnp.asarray(body_points, dtype)
+    number = lambda value: jnp.asarray(value, dtype)  # noqa: E731
+    membrane = None if physics.membrane.model == "none" else physics.membrane.model
+    numbers = tuple(getattr(physics.membrane, n) for n in MEMBRANES[membrane][1]) if membrane else ()
+    model = Model(
+        skeleton=skeleton,
+        rest_rotations=None if rest_rotations is None else jnp.asarray(rest_rotations[columns], dtype),
+        garment=Garment(mesh, jnp.asarray(pins, jnp.int32)),
+        blend=blend_from(weights[:, columns], dtype=dtype),
+        material=Material(
+            density=number(physics.density),
+            membrane=tuple(number(n) for n in numbers),
+            bending=number(physics.bending.stiffness),
+            collision=number(physics.collision.stiffness),
+            thickness=number(physics.collision.thickness),
+            pinning=number(physics.pinning.stiffness),
+            gravity=number(physics.gravity),
+        ),
+        basis=_basis(scene, mesh, dtype),
+        body=body_points,
+        body_blend=body_blend,
+        surface=surface,
+        terms=Terms(
+            membrane=membrane if any(numbers) else None,
+            bending=physics.bending.stiffness > 0,
+            collision=physics.collision.distance if collides else None,
+            exact=physics.collision.search == "exact",
+            gravity=any(physics.gravity),
+            inertia=physics.inertia and moves,
+            pinning=len(pins) > 0 and physics.pinning.stiffness > 0,
+        ),
+        inputs=tuple(place[j] for j in inputs),
+        source_joints=kept,
+        descriptor=scene.network.descriptor,
+        fps=scene.motion.fps,
+        moves=moves,
+    )
+    tracks = {name: track_of(model, r) for name, r in records.items()}
+    train = {name: tracks[name] for name in train_names}
+    if scene.motion.mirror and body is not None:
+        partner = mirror_partners(body.joint_names, joints)
+        for name in train_names:
+            r = records[name]
+            train[f"{name} (mirrored)"] = track_of(model, io.MotionRecord(*mirror(r.poses, r.translation, partner), r.fps, ()))
+    if motions and not train:
+        still = io.MotionRecord(np.zeros((1, len(parents), 3), np.float32), np.zeros((1, 3), np.float32), model.fps, ())
+        train["rest pose"] = track_of(model, still)
+    return Assembly(
+        scene=scene,
+        model=model,
+        network=_network(scene, model),
+        body=body,
+        garment=garment,
+        train=train,
+        validation={name: tracks[name] for name in (scene.motion.validation if motions else ())},
+    )
+
+
+def track_of(model: Model, record: io.MotionRecord) -> Track:
+    """Descriptors and transforms of a motion that is at the model's frame rate."""
+    dtype = model.skeleton.joints.dtype
+    return track(model, local_rotations(model, jnp.asarray(record.poses, dtype)), jnp.asarray(record.translation, dtype))
+
+
+def _network(scene: Scene, model: Model) -> NCS:
+    spec = scene.network
+    return NCS(
+        static=StaticEncoder(spec.static),
+        dynamic=DynamicEncoder(spec.joint, spec.dynamic, spec.static[-1]) if model.moves else None,
+        decoder=Decoder(model.garment.mesh.rest.shape[0], spec.decoder, model.basis.shape[1]),
+        learn_weights=scene.garment.learn_weights,
+    )
+
+
+def _basis(scene: Scene, mesh, dtype):
+    count = min(scene.network.modes, mesh.rest.shape[0] - 1)
+    if not count:
+        return jnp.zeros((mesh.rest.shape[0], 0), dtype)
+    return modal_basis(np.asarray(mesh.rest), np.asarray(mesh.faces), np.asarray(mesh.vertex_area), count, dtype=dtype)
+
+
+def _closure(joints, parents) -> list[int]:
+    found = set(joints)
+    for j in joints:
+        while (j := int(parents[j])) >= 0:
+            found.add(j)
+    return sorted(found)
+
+
+def _pins(scene: Scene, garment: io.GarmentRecord) -> np.ndarray:
+    name = scene.garment.pins
+    if not name:
+        return np.zeros(0, np.int32)
+    if name not in garment.groups:
+        known = ", ".join(garment.groups) or "none"
+        raise InputError(
+            "no such vertex group in the garment", file=scene.source, field="garment.pins", value=name,
+            mend=f"groups there: {known}",
+        )  # fmt: skip
+    return np.asarray(garment.groups[name], np.int32)
+
+
+def _part(scene, body, garment, parents, weights, records) -> np.ndarray:
+    if scene.body.part == "all":
+        return np.arange(len(body.vertices))
+    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in parents))
+    poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(parents), 3), np.float32)
+    looked = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
+    local = np.asarray(axis_angle_to_matrix(jnp.asarray(looked)))
+    if body.rest_rotations is not None:
+        local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
+    near = touchable(
+        skeleton,
+        garment.vertices,
+        blend_from(weights),
+        body.vertices,
+        blend_from(body.weights),
+        list(local),
+        scene.physics.collision.reach,
+    )
+    return np.unique(body.faces[near[body.faces].any(axis=1)])
+
+
+def _submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:
+    place = np.full(verts, -1)
+    place[kept] = np.arange(len(kept))
+    inside = place[faces]
+    return inside[(inside >= 0).all(axis=1)]

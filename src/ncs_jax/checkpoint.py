@@ -1,0 +1,84 @@
+"""Run folders: Orbax checkpoints, and the JSON that rebuilds everything else.
+
+    RUN/run.json                the scene, the steps planned, the seed, the versions
+    RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
+    RUN/log.csv                 one row a report
+
+Every write goes to a temporary name first and is renamed when complete, so a kill at any moment leaves the last good one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ncs_jax.errors import InputError
+
+__all__ = ["Checkpoints", "read_run", "write_run"]
+
+
+def write_run(run: Path, facts: dict) -> None:
+    """Write RUN/run.json atomically.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        temporary = run / "run.json.part"
+        temporary.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        os.replace(temporary, run / "run.json")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"a folder that can be written expected: {reason}", file=run, mend="choose another --out") from None
+
+
+def read_run(run: Path) -> dict:
+    """Read RUN/run.json.
+
+    Raises:
+        InputError: the folder is not a run.
+    """
+    path = Path(run) / "run.json"
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no run there", file=path, mend="give a folder that ncs train made") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"not a run file: {error}", file=path, mend="train again into a new folder") from None
+    if not isinstance(facts, dict) or "scene" not in facts or "steps" not in facts:
+        raise InputError("not a run file", file=path, field="scene", mend="train again into a new folder")
+    return facts
+
+
+class Checkpoints:
+    """The checkpoints of one run. Orbax writes each into a temporary folder and renames it when it is whole."""
+
+    def __init__(self, run: Path):
+        import orbax.checkpoint as ocp
+
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True)
+        self._manager = ocp.CheckpointManager((Path(run) / "checkpoints").absolute(), options=options)
+        self._args = ocp.args
+
+    def save(self, step: int, state: Any) -> None:
+        """Write the state after `step` steps."""
+        self._manager.save(step, args=self._args.StandardSave(state))
+        self._manager.wait_until_finished()
+
+    def latest(self) -> int | None:
+        """The newest whole checkpoint's step."""
+        return self._manager.latest_step()
+
+    def restore(self, like: Any) -> Any:
+        """The newest state, with the shapes and types of `like`."""
+        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), like)
+        return self._manager.restore(self.latest(), args=self._args.StandardRestore(shapes))
+
+    def close(self) -> None:
+        """Wait for pending writes."""
+        self._manager.close()

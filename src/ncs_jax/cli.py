@@ -1,0 +1,280 @@
+"""The command line: ncs demo, train, animate, evaluate, check."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from ncs_jax.errors import InputError
+
+__all__ = ["main"]
+
+DESCRIPTION = """\
+Neural cloth simulation: a garment learns to move on an animated character from physics alone.
+
+  ncs demo                          train the packaged T-shirt and write a preview to look at
+  ncs train SCENE --out RUN         train the garment of a scene file (ncs:tshirt and ncs:skirt come with the package)
+  ncs animate RUN --out FILE        animate a trained garment
+  ncs evaluate RUN                  strain, penetration, energies in physical units
+  ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; the exit code is 0, or 2 for input that cannot be used, or 130 when interrupted."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        return parsed.run(parsed)
+    except InputError as error:
+        print(f"ncs: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("ncs: interrupted; `ncs train --resume` goes on from the last checkpoint", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="ncs", description=DESCRIPTION, formatter_class=raw)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name, run, text):
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(run=run)
+        return sub
+
+    demo = command("demo", _demo, "train the packaged T-shirt and write pictures and a page that plays it")
+    demo.add_argument("--out", default="runs/demo", help="run folder (default: runs/demo)")
+    demo.add_argument("--minutes", type=_positive, default=3.0, help="minutes of training (default: 3)")
+    demo.add_argument("--scene", default="ncs:demo", help="another scene file")
+
+    train = command("train", _train, "train the garment of a scene file from the physics energy alone")
+    train.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
+    train.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints and logs")
+    train.add_argument("--steps", type=_whole, help="optimiser steps (default: the scene's)")
+    train.add_argument("--minutes", type=_positive, help="train for about this long instead of a number of steps")
+    train.add_argument("--seed", type=int, help="seed (default: the scene's)")
+    train.add_argument("--resume", action="store_true", help="go on with the run in --out from its last checkpoint")
+    train.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
+
+    animate = command("animate", _animate, "animate a trained garment over a motion")
+    animate.add_argument("folder", metavar="RUN", help="folder that ncs train made")
+    animate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    animate.add_argument(
+        "--alpha", type=float, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates"
+    )
+    animate.add_argument("--out", required=True, metavar="FILE", help=".npz, .h5, .pc2, or a folder of .obj")
+
+    evaluate = command("evaluate", _evaluate, "measure strain, shear, penetration, energies and forces out of balance")
+    evaluate.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
+    evaluate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's)")
+    evaluate.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
+    evaluate.add_argument("--alpha", type=float, default=1.0, help="motion control")
+    evaluate.add_argument("--json", action="store_true", help="print JSON, with every frame")
+
+    check = command("check", _check, "read and assemble a scene without training it")
+    check.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME")
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"a number above 0 expected, found {text}")
+    return value
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"a whole number from 1 expected, found {text}")
+    return value
+
+
+def _train(options) -> int:
+    run = _trained(options.scene, options.out, options.steps, options.minutes, options.seed, options.resume)
+    if options.preview:
+        _previews(run, options.out)
+    return 0
+
+
+def _demo(options) -> int:
+    out = Path(options.out)
+    resume = (out / "run.json").exists()
+    run = _trained(options.scene, out, None, options.minutes, None, resume)
+    quantities = _previews(run, out)
+    motion = run.assembly.scene.motion.validation
+    print(f"On {motion[0] if motion else 'its own motion'}, which it never trained on:" if motion else "On its motion:")
+    print(f"  mean strain {quantities['strain_mean']:.2f} %, penetrating vertices {quantities['penetrating']:.2f} %")
+    return 0
+
+
+def _previews(run, out) -> dict[str, float]:
+    from ncs_jax.preview import preview
+
+    print("drawing the preview ...", flush=True)
+    quantities = preview(run, out)
+    for name in ("preview.png", "preview.gif", "preview.html", "energies.png"):
+        if (Path(out) / name).exists():
+            print(f"  {Path(out) / name}")
+    return quantities
+
+
+def _trained(scene, out, steps, minutes, seed, resume):
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from ncs_jax.runs import train
+
+    console = Console()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=None),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=False) as progress:
+        task = progress.add_task("reading the scene and compiling", total=None)
+
+        def show(r):
+            parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
+            text = (
+                f"step {r.step}/{r.steps}  [bold]{sum(r.energies.values()):.4f} J[/bold]  ({parts})\n"
+                f"strain {r.strain:.1f} %  penetrating {r.penetrating:.1f} %  {_clock(r.left)} left"
+                + (f"  dropped {r.dropped}" if r.dropped else "")
+            )
+            progress.update(task, total=r.steps, completed=r.step, description=text)
+            if r.message:
+                progress.print(f"step dropped: {r.message}")
+            if r.validation:
+                words = ", ".join(f"{k} {v:.4g}" for k, v in r.validation.items())
+                progress.print(f"step {r.step}: validation {words}")
+            if not console.is_terminal and (r.step % 100 == 0 or r.step == r.steps):
+                print(f"step {r.step}/{r.steps} total {sum(r.energies.values()):.4f} {parts} strain {r.strain:.1f} %"
+                      f" penetrating {r.penetrating:.1f} % {_clock(r.left)} left", flush=True)  # fmt: skip
+
+        return train(scene, out, steps=steps, minutes=minutes, seed=seed, resume=resume, report=show)
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def _default_motions(scene) -> tuple[str, ...]:
+    return (*scene.motion.files, *scene.motion.validation)
+
+
+def _animate(options) -> int:
+    from ncs_jax import io
+    from ncs_jax.runs import load_run
+
+    run = load_run(options.folder)
+    motions = (options.motion,) if options.motion else _default_motions(run.assembly.scene)
+    if not motions:
+        raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+    motion = motions[0] if options.motion is None or options.motion.startswith("ncs:") else str(Path(motions[0]).resolve())
+    vertices = run.animate(motion, options.alpha)
+    io.write_animation(options.out, vertices, run.assembly.garment.faces, run.assembly.model.fps)
+    print(f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices")
+    return 0
+
+
+def _evaluate(options) -> int:
+    import numpy as np
+
+    from ncs_jax import io
+    from ncs_jax.assembly import assemble, load_motion, track_of
+    from ncs_jax.evaluation import QUANTITIES, measure, summarise
+    from ncs_jax.runs import load_run
+    from ncs_jax.scene import load_scene
+
+    target = Path(options.target)
+    rows = {}
+    if target.is_dir() and not options.scene:
+        run = load_run(target)
+        names = (options.motion,) if options.motion else tuple(dict.fromkeys(_default_motions(run.assembly.scene)))
+        for name in names:
+            path = name if options.motion is None or name.startswith("ncs:") else str(Path(name).resolve())
+            rows[name] = run.evaluate(path, options.alpha)
+    else:
+        if not options.scene:
+            raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
+        animation, scene = io.read_animation(target), load_scene(options.scene)
+        assembly = assemble(scene, motions=False)
+        names = (options.motion,) if options.motion else _default_motions(scene)
+        if not names:
+            raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
+        path = names[0] if options.motion is None or names[0].startswith("ncs:") else str(Path(names[0]).resolve())
+        track = track_of(assembly.model, load_motion(scene, path, assembly.body))
+        expected = (track.start.shape[0], *assembly.model.garment.mesh.rest.shape)
+        if animation.vertices.shape != expected:
+            raise InputError(
+                f"frames, vertices and 3 of the scene expected, {expected}", file=target, field="vertices",
+                value=animation.vertices.shape, mend="give the --motion and --scene that it was made from",
+            )  # fmt: skip
+        rows[names[0]] = measure(assembly.model, np.asarray(animation.vertices, np.float32), track)
+    if options.json:
+        print(json.dumps({n: {"mean": summarise(r), "frames": {k: v.tolist() for k, v in r.items()}} for n, r in rows.items()}))
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{options.target}: means over the frames (median for out_of_balance, largest for depth_max)")
+    table.add_column("quantity")
+    table.add_column("unit")
+    for name in rows:
+        table.add_column(Path(name).stem if not name.startswith("ncs:") else name, justify="right")
+    means = {name: summarise(r) for name, r in rows.items()}
+    for quantity in next(iter(means.values())):
+        unit = QUANTITIES.get(quantity, ("J", ""))[0]
+        table.add_row(quantity, unit, *(f"{m[quantity]:.4g}" for m in means.values()))
+    Console().print(table)
+    return 0
+
+
+def _check(options) -> int:
+    from ncs_jax.assembly import assemble
+    from ncs_jax.scene import load_scene
+
+    assembly = assemble(load_scene(options.scene))
+    model, mesh = assembly.model, assembly.model.garment.mesh
+    names = assembly.body.joint_names if assembly.body is not None else ()
+    joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
+    terms = model.terms
+    on = [n for n in ("membrane", "bending", "collision", "gravity", "inertia", "pinning") if getattr(terms, n)]
+    print(f"{options.scene}: good")
+    mass = float((mesh.vertex_area * model.material.density).sum())
+    size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
+    print(f"  garment   {mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
+    if model.body is not None:
+        print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+    print(f"  joints    {', '.join(joints)}")
+    print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
+    for kind, tracks in (("train", assembly.train), ("validate", assembly.validation)):
+        for name, track in tracks.items():
+            print(f"  {kind:9} {name}: {track.start.shape[0]} frames at {model.fps:g} per second")
+    if not model.moves:
+        print("  the character never moves: only the static network is trained")
+    if model.surface is not None:
+        clearance = _clearance(model)
+        if clearance < 0:
+            print(f"  warning   the rest garment is up to {-1000 * clearance:.1f} mm inside the body: push it out")
+    return 0
+
+
+def _clearance(model) -> float:
+    """Least signed distance of the rest garment to the resting body, m."""
+    from ncs_jax.energies.collision import nearest_triangle, triangle_distance
+
+    x = model.garment.mesh.rest
+    index, _ = nearest_triangle(x, model.body, model.surface)
+    return float(triangle_distance(x, model.body, model.surface, index).min())
+
+
+if __name__ == "__main__":
+    os._exit(main())

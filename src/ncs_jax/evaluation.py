@@ -1,0 +1,98 @@
+"""What an animation is worth, in physical quantities, frame by frame."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.collision import nearest_triangle, triangle_distance
+from ncs_jax.energies.membrane import deformation
+from ncs_jax.kinematics import blend
+from ncs_jax.mesh import dihedral
+from ncs_jax.model import Model, pose_body
+from ncs_jax.motion import Track
+from ncs_jax.numerics import angle_between, norm
+from ncs_jax.objective import Frame, energies
+
+__all__ = ["QUANTITIES", "measure", "summarise"]
+
+# name: unit and what it is
+QUANTITIES = {
+    "strain_mean": ("%", "mean |l/l0 - 1| over the edges"),
+    "strain_p99": ("%", "99th percentile of |l/l0 - 1| over the edges"),
+    "shear_mean": ("deg", "mean deviation of warp and weft from a right angle, by area"),
+    "hinge_mean": ("deg", "mean |phi - phi_rest| over the hinges"),
+    "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
+    "depth_max": ("mm", "deepest penetration"),
+    "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
+}
+
+
+def _frame(model: Model, x, previous, before, matrices) -> dict[str, Float[Array, ""]]:
+    mesh, terms = model.garment.mesh, model.terms
+    body = None if model.body is None else pose_body(model, matrices)
+    blended = blend(matrices, model.blend) if terms.pinning else None
+    frame = Frame(1 / model.fps, previous, before, body, blended)
+
+    def value(x):
+        parts = energies(x, model.garment, model.material, frame, terms, model.surface)
+        return sum(parts.values()), parts
+
+    (total, parts), gradient = jax.value_and_grad(value, has_aux=True)(x)
+    mass = model.material.density * mesh.vertex_area
+    heavy = mass > 0
+    square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
+    strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+    w = deformation(x, mesh)
+    shear = jnp.abs(angle_between(w[0], w[1]) - np.pi / 2)
+    bend = dihedral(x[mesh.hinges], jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)) - mesh.hinge_angle
+    bend = bend - 2 * np.pi * jnp.round(bend / (2 * np.pi))
+    result = {
+        "total": total,
+        **parts,
+        "strain_mean": 100 * jnp.mean(strain),
+        "strain_p99": 100 * jnp.percentile(strain, 99),
+        "shear_mean": jnp.degrees(jnp.sum(mesh.face_area * shear) / jnp.sum(mesh.face_area)),
+        "hinge_mean": jnp.degrees(jnp.mean(jnp.abs(bend))),
+        "out_of_balance": jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81,
+    }
+    if model.surface is not None:
+        index, _ = nearest_triangle(x, body, model.surface)
+        depth = -triangle_distance(x, body, model.surface, index)
+        result["penetrating"] = 100 * jnp.mean(depth > 0)
+        result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
+    return result
+
+
+@functools.partial(jax.jit)
+def _measure(model, vertices, matrices):
+    frames = jnp.arange(vertices.shape[0])
+
+    def one(t):
+        previous, before = vertices[jnp.maximum(t - 1, 0)], vertices[jnp.maximum(t - 2, 0)]
+        return _frame(model, vertices[t], previous, before, matrices[t])
+
+    return lax.map(one, frames)
+
+
+def measure(model: Model, vertices: Float[Array, "frames verts 3"], track: Track) -> dict[str, np.ndarray]:
+    """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
+
+    Args:
+        vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
+
+    Energies use the scene's own terms; penetration uses the exact signed distance to the body's triangles. Before its first
+    frame the garment is taken to have been at rest.
+    """
+    return {name: np.asarray(v) for name, v in _measure(model, jnp.asarray(vertices), track.matrices).items()}
+
+
+def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means over the frames; the largest for `depth_max`, the median for `out_of_balance`."""
+    special = {"depth_max": np.max, "out_of_balance": np.median}
+    return {name: float(special.get(name, np.mean)(values)) for name, values in rows.items()}

@@ -1,0 +1,78 @@
+"""What a run looks like: pictures, curves, and one page that plays it."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.assembly import load_motion
+from ncs_jax.evaluation import summarise
+from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.rotations import axis_angle_to_matrix
+from ncs_jax.runs import Run
+
+__all__ = ["posed_body", "preview"]
+
+ALPHAS = (0.0, 1.0, 1.5)
+
+
+def posed_body(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
+    """The whole body's vertices over a motion, (frames, body, 3) in m."""
+    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
+    weights, rest = blend_from(body.weights), jnp.asarray(body.vertices, jnp.float32)
+    local = axis_angle_to_matrix(jnp.asarray(motion.poses, jnp.float32))
+    if body.rest_rotations is not None:
+        local = to_rest_axes(local, jnp.asarray(body.rest_rotations, jnp.float32))
+
+    @jax.jit
+    def run(local, translation):
+        matrices = transforms(skeleton, forward(skeleton, local, translation))
+        return jax.lax.map(lambda m: skin(blend(m, weights), rest), matrices)
+
+    return np.asarray(run(local, jnp.asarray(motion.translation, jnp.float32)))
+
+
+def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: str = "") -> dict[str, float]:
+    """Write preview.png, preview.gif, preview.html and energies.png into a folder; return the motion's evaluation at alpha 1.
+
+    Args:
+        run: trained. folder: where to. motion: a motion's name or file; else the scene's first validation or training motion.
+    """
+    from ncs_jax import pictures, viewer
+
+    folder = Path(folder)
+    scene, body = run.assembly.scene, run.assembly.body
+    names = (motion,) if motion else (*scene.motion.validation, *scene.motion.files)
+    name = names[0] if names else "rest pose"
+    track = run.track(name)
+    alphas = ALPHAS if run.assembly.network.dynamic is not None else (0.0,)
+    animations = {f"{alpha:g}": run.animate(track, alpha) for alpha in alphas}
+    garment = animations["1"] if "1" in animations else animations["0"]
+    faces = run.assembly.garment.faces
+    body_vertices = body_faces = None
+    if body is not None and name in names:
+        body_vertices, body_faces = posed_body(body, load_motion(scene, name, body)), body.faces
+    fps = run.assembly.model.fps
+    quantities = summarise(run.evaluate(track))
+    facts = {
+        "motion": name,
+        "trained": f"{run.steps} steps on {', '.join(scene.motion.files)}",
+        "mean strain": f"{quantities['strain_mean']:.2f} %",
+    }
+    if "penetrating" in quantities:
+        facts["penetrating vertices"] = f"{quantities['penetrating']:.2f} %"
+    pictures.contact_sheet(folder / "preview.png", garment, faces, body_vertices, body_faces, fps)
+    pictures.animation_gif(folder / "preview.gif", garment, faces, body_vertices, body_faces, fps)
+    viewer.write_page(
+        folder / "preview.html", animations, faces, body_vertices, body_faces, fps, title or "Neural cloth simulation", facts
+    )
+    log = folder / "log.csv"
+    if log.exists():
+        with log.open(newline="") as file:
+            pictures.energy_curves(folder / "energies.png", list(csv.DictReader(file)))
+    return quantities

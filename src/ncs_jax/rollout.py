@@ -1,0 +1,108 @@
+"""Animate with a trained network: frame by frame with explicit state, or a whole motion at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ncs_jax import descriptors
+from ncs_jax.descriptors import Joints
+from ncs_jax.kinematics import blend, forward, skin, transforms
+from ncs_jax.methods.ncs import NCS, decode, for_inference, garment_blend, static_codes
+from ncs_jax.model import Model
+from ncs_jax.motion import Track, input_joints
+
+__all__ = ["Rollout", "State", "animate", "stepper"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """What a stream carries from frame to frame: the recurrent code and the joints of the two frames before."""
+
+    code: Float[Array, "code"]
+    previous: Joints
+    before: Joints
+    started: Bool[Array, ""]
+
+
+class Rollout(NamedTuple):
+    """`init() -> state`; `step(state, rotations, translation, alpha) -> (state, vertices)`."""
+
+    init: object
+    step: object
+
+
+def stepper(model: Model, network: NCS, params: dict) -> Rollout:
+    """A streaming animator: pure functions with explicit state, to be jitted by the caller.
+
+    `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`), the root's
+    translation (3,) in m and alpha, and returns the state and the garment's vertices (verts, 3) in m. Frame for frame it gives
+    what `animate` gives.
+    """
+    rest = model.garment.mesh.rest
+    network, params = for_inference(network, params, model)
+    weights = garment_blend(network, params, model)
+    g = model.material.gravity
+
+    def init() -> State:
+        n = len(model.inputs)
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=rest.dtype), (n, 3, 3))
+        joints = Joints(eye, eye, jnp.zeros((n, 3), rest.dtype))
+        size = network.dynamic.state if network.dynamic is not None else 0
+        return State(jnp.zeros(size, rest.dtype), joints, joints, jnp.asarray(False))
+
+    def step(state: State, rotations, translation, alpha=1.0):
+        pose = forward(model.skeleton, rotations, translation)
+        now = input_joints(model, rotations, pose)
+        previous, before = (
+            jax.tree.map(lambda old, new: jnp.where(state.started, old, new), old, now)
+            for old in (state.previous, state.before)
+        )
+        z = static_codes(network, params, descriptors.static(now, g, model.descriptor))
+        code = state.code
+        if network.dynamic is not None:
+            d = descriptors.dynamic(now, previous, before, g, 1 / model.fps, model.descriptor)
+            variables = {"params": params["dynamic"]}
+            features = network.dynamic.apply(variables, d, method="features")
+            code = network.dynamic.apply(variables, code, features, method="step")
+            z = z + alpha * code
+        offsets = decode(network, params, model, z)
+        x = skin(blend(transforms(model.skeleton, pose), weights), rest + offsets)
+        return State(code, now, previous, jnp.asarray(True)), x
+
+    return Rollout(init, step)
+
+
+def dynamic_codes(network: NCS, params: dict, track: Track) -> Float[Array, "frames code"]:
+    """z_D of every frame of one motion, from rest at its start."""
+    rest = jnp.zeros(network.dynamic.state, track.dynamic.dtype)
+    return network.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest)
+
+
+def animate(
+    model: Model, network: NCS, params: dict, track: Track, alpha: float | Float[Array, ""] | None = 1.0
+) -> Float[Array, "frames verts 3"]:
+    """Vertices of the garment over one whole motion, m: z = z_S + alpha z_D (15), decoded and skinned (16).
+
+    Args:
+        track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
+            dynamic (alpha = 0 gives the same vertices).
+    """
+    network, params = for_inference(network, params, model)
+    z = static_codes(network, params, track.static)
+    if network.dynamic is not None and alpha is not None:
+        z = z + alpha * dynamic_codes(network, params, track)
+    decoded = decode(network, params, model, z)
+    weights = garment_blend(network, params, model)
+
+    def pose(args):
+        matrices, offsets = args
+        return skin(blend(matrices, weights), model.garment.mesh.rest + offsets)
+
+    return lax.map(pose, (track.matrices, decoded))

@@ -1,0 +1,266 @@
+"""Train into a run folder, resume it, load it again."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
+from ncs_jax.checkpoint import Checkpoints, read_run, write_run
+from ncs_jax.errors import InputError
+from ncs_jax.evaluation import measure, summarise
+from ncs_jax.motion import Track
+from ncs_jax.rollout import animate
+from ncs_jax.scene import Scene, load_scene, scene_from
+from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, glance, initial_state
+
+__all__ = ["Report", "Run", "load_run", "train"]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What training says after every chunk: the step, energies by term in J, strain and penetration in %, and the time."""
+
+    step: int
+    steps: int
+    energies: dict[str, float]
+    strain: float
+    penetrating: float
+    dropped: int
+    seconds: float
+    left: float
+    message: str = ""
+    validation: dict[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained garment: its scene made ready, and the parameters."""
+
+    assembly: Assembly
+    params: dict
+    steps: int = 0
+
+    def track(self, motion: str) -> Track:
+        """A motion file, `ncs:NAME` or one of the scene's motions, ready to animate."""
+        known = {**self.assembly.train, **self.assembly.validation}
+        if motion in known:
+            return known[motion]
+        return track_of(self.assembly.model, load_motion(self.assembly.scene, motion, self.assembly.body))
+
+    def animate(self, motion: str | Track, alpha: float = 1.0) -> np.ndarray:
+        """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves."""
+        track = self.track(motion) if isinstance(motion, str) else motion
+        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, track, alpha))
+
+    def evaluate(self, motion: str | Track, alpha: float = 1.0) -> dict[str, np.ndarray]:
+        """Physical quantities per frame, see `evaluation.QUANTITIES`."""
+        track = self.track(motion) if isinstance(motion, str) else motion
+        return measure(self.assembly.model, jnp.asarray(self.animate(track, alpha)), track)
+
+
+_animate = jax.jit(animate, static_argnums=1)
+
+
+def load_run(folder: str | Path, *, motions: bool = False) -> Run:
+    """Load a run folder: the scene from its JSON, the parameters from its newest checkpoint.
+
+    Raises:
+        InputError: not a run folder, or a file of its scene is gone.
+    """
+    folder = Path(folder)
+    facts = read_run(folder)
+    scene = scene_from(facts["scene"], source=str(folder / "run.json"))
+    assembly = assemble(scene, motions=motions, moves=facts["moves"])
+    if not (folder / "checkpoints").is_dir():
+        raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
+    checkpoints = Checkpoints(folder)
+    step = checkpoints.latest()
+    if step is None:
+        raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
+    like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
+    params = checkpoints.restore(like).params
+    checkpoints.close()
+    return Run(assembly, params, step)
+
+
+def train(
+    scene: Scene | str | Path,
+    out: str | Path | None = None,
+    *,
+    steps: int | None = None,
+    minutes: float | None = None,
+    seed: int | None = None,
+    resume: bool = False,
+    report: Callable[[Report], None] | None = None,
+) -> Run:
+    """Train a garment from the physics energy alone.
+
+    Args:
+        scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
+        steps: optimiser steps, else the scene's. minutes: instead, as many steps as fit. seed: else the scene's.
+        resume: continue the run in `out`; its steps and seed stand. report: called after every chunk of steps.
+
+    Raises:
+        InputError: the scene or the folder is unusable.
+    """
+    scene = load_scene(scene) if isinstance(scene, str | Path) else scene
+    began = time.monotonic()
+    out = None if out is None else Path(out)
+    facts = None
+    if out is not None and (out / "run.json").exists():
+        if not resume:
+            raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
+        facts = read_run(out)
+        scene = scene_from(facts["scene"], source=str(out / "run.json"))
+    elif resume:
+        raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
+    assembly = assemble(scene)
+    spec, model, network, track = scene.training, assembly.model, assembly.network, assembly.track
+    seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
+    run_chunk = chunk_runner(network, spec)
+    look = jax.jit(lambda model, params, track, ends: glance(model, network, spec.window, params, track, ends))
+    frames = track.start.shape[0]
+
+    def indices(first, count):
+        ends = batches(frames, spec.batch, seed, first, count)
+        pairs = np.stack([np.random.default_rng([seed, 1, s]).permutation(spec.batch) for s in range(first, first + count)])
+        return jnp.asarray(ends), jnp.asarray(pairs.astype(np.int32))
+
+    if out is not None and facts is None:
+        write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict(), "moves": model.moves})
+    if facts is not None and facts["steps"]:
+        steps = facts["steps"]
+    elif minutes is not None:
+        steps = _fitting_steps(began, minutes, lambda n, s: run_chunk(s, *indices(0, n), n, model, track), model, network)
+    else:
+        steps = steps or spec.steps
+    if out is not None and (facts is None or not facts["steps"]):
+        facts = {"steps": steps, "seed": seed, "scene": scene.to_dict(), "moves": model.moves, "versions": _versions()}
+        write_run(out, facts)
+
+    state = initial_state(model, network, seed)
+    checkpoints = None if out is None else Checkpoints(out)
+    if resume and checkpoints is not None and checkpoints.latest() is not None:
+        state = checkpoints.restore(state)
+    first = int(state.step)
+    log = None if out is None else _Log(out, first)
+    every = -(-spec.checkpoint_every // CHUNK) * CHUNK
+    check = -(-spec.validate_every // CHUNK) * CHUNK
+    dropped, started, pace = int(state.dropped), time.monotonic(), None
+    for at, count in chunks(first, steps):
+        ends, pairs = indices(at, count)
+        state, logs = run_chunk(state, ends, pairs, steps, model, track)
+        energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
+        done = at + count
+        seen = {k: float(v) for k, v in look(model, state.params, track, ends[-1, :4]).items()}
+        message = ""
+        if int(state.dropped) > dropped:
+            dropped = int(state.dropped)
+            message = diagnose(model, network, state.params, track, state.fault)
+        validation = None
+        if assembly.validation and (done % check == 0 or done == steps):
+            validation = _validate(Run(assembly, state.params))
+        now = time.monotonic()
+        if pace is None:  # the first chunk compiles: it does not count for the pace
+            pace, started = 0.0, now
+        else:
+            pace = (now - started) / (done - first - min(CHUNK, count))
+        entry = Report(
+            done, steps, energies, seen["strain"], seen.get("penetrating", 0.0), dropped, now - began,
+            pace * (steps - done), message, validation,
+        )  # fmt: skip
+        if log is not None:
+            log.write(entry)
+        if report is not None:
+            report(entry)
+        if checkpoints is not None and (done % every == 0 or done == steps):
+            checkpoints.save(done, state)
+    if checkpoints is not None:
+        if checkpoints.latest() is None:
+            checkpoints.save(int(state.step), state)
+        checkpoints.close()
+    if log is not None:
+        log.close()
+    return Run(assembly, state.params, steps)
+
+
+def _fitting_steps(began: float, minutes: float, run, model, network) -> int:
+    """How many steps fit, from the pace of two chunks after the compiling one, on a state that is then thrown away."""
+    state = initial_state(model, network, 0)
+    state, _ = run(CHUNK, state)
+    jax.block_until_ready(state)
+    start = time.monotonic()
+    for _ in range(2):
+        state, _ = run(CHUNK, state)
+    jax.block_until_ready(state)
+    now = time.monotonic()
+    pace = (now - start) / (2 * CHUNK)
+    return max(CHUNK, int((60 * minutes - (now - began)) / (1.05 * pace)) // CHUNK * CHUNK)
+
+
+def _validate(run: Run) -> dict[str, float]:
+    """Mean over the validation motions of total energy, strain and penetration."""
+    rows = [summarise(run.evaluate(track)) for track in run.assembly.validation.values()]
+    return {k: float(np.mean([r[k] for r in rows])) for k in ("total", "strain_mean", "penetrating") if k in rows[0]}
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "python": platform.python_version(),
+        **{p: version(p) for p in ("ncs-jax", "jax", "flax", "optax", "orbax-checkpoint")},
+    }
+
+
+class _Log:
+    """RUN/log.csv and, where tensorboardX is installed, RUN/tensorboard. A resumed run drops the rows after its checkpoint."""
+
+    def __init__(self, run: Path, first: int):
+        self._path = run / "log.csv"
+        self._names: list[str] | None = None
+        if first and self._path.exists():
+            with self._path.open(newline="") as file:
+                rows = list(csv.reader(file))
+            kept = rows[:1] + [r for r in rows[1:] if r and r[0].isdigit() and int(r[0]) <= first]
+            temporary = self._path.with_suffix(".part")
+            with temporary.open("w", newline="") as file:
+                csv.writer(file).writerows(kept)
+            os.replace(temporary, self._path)
+            self._names = rows[0] if rows else None
+        self._file = self._path.open("a" if self._names else "w", newline="")
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError:
+            self._board = None
+        else:
+            self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first or None)
+
+    def write(self, r: Report) -> None:
+        validation = {f"validation_{k}": v for k, v in (r.validation or {}).items()}
+        row = {"step": r.step, "total": sum(r.energies.values()), **r.energies, "strain": r.strain}
+        row |= {"penetrating": r.penetrating, "dropped": r.dropped, "seconds": round(r.seconds, 3)}
+        if self._names is None:
+            self._names = [*row, "validation_total", "validation_strain_mean", "validation_penetrating"]
+            csv.writer(self._file).writerow(self._names)
+        row |= validation
+        csv.writer(self._file).writerow([row.get(n, "") for n in self._names])
+        self._file.flush()
+        if self._board is not None:
+            for name, value in row.items():
+                if name not in ("step", "seconds"):
+                    self._board.add_scalar(name, value, r.step)
+
+    def close(self) -> None:
+        self._file.close()
+        if self._board is not None:
+            self._board.close()

@@ -1,0 +1,255 @@
+"""Training is simulating: an Optax loop on the physics energy alone, with no simulated data."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.kinematics import Blend, blend, skin
+from ncs_jax.methods.ncs import NCS, decode, garment_blend, initial_parameters, window_codes
+from ncs_jax.model import Model, pose_body
+from ncs_jax.motion import Track
+from ncs_jax.numerics import norm
+from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.scene import TrainingSpec
+
+__all__ = [
+    "CHUNK",
+    "Fault",
+    "TrainState",
+    "batches",
+    "chunk_runner",
+    "chunks",
+    "diagnose",
+    "glance",
+    "gradients",
+    "initial_state",
+    "step_size",
+]
+
+CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Fault:
+    """The last dropped step: what its first bad sample looked like, enough to find the term and the element again."""
+
+    step: Int[Array, ""]
+    frame: Int[Array, ""]
+    offsets: Float[Array, "3 verts 3"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class TrainState:
+    """Everything that training carries from step to step."""
+
+    params: dict
+    optimiser: optax.OptState
+    step: Int[Array, ""]
+    dropped: Int[Array, ""]
+    fault: Fault
+
+
+ADAM = optax.scale_by_adam()
+
+
+def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
+    """From the learning rate down to 2 % of it along a cosine, at the last of `steps`."""
+    fall = jnp.clip(step / jnp.maximum(steps, 1), 0, 1)
+    return spec.learning_rate * (0.02 + 0.98 * (1 + jnp.cos(jnp.pi * fall)) / 2)
+
+
+def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
+    """Fresh parameters and a fresh optimiser."""
+    params = initial_parameters(network, jax.random.PRNGKey(seed), model)
+    zero = jnp.zeros((), jnp.int32)
+    fault = Fault(zero - 1, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
+    # Copies: the two counters must not share a buffer that a step is given to reuse.
+    return TrainState(params, ADAM.init(params), zero, jnp.zeros((), jnp.int32), fault)
+
+
+def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
+    """The last frames of the windows of steps first .. first + count, (count, batch): every frame once a round, shuffled.
+
+    A pure function of its arguments, so that a resumed run sees what an unbroken one would have seen.
+    """
+    wanted = np.arange(first * batch, (first + count) * batch)
+    rounds = wanted // frames
+    shuffled = {r: np.random.default_rng([seed, int(r)]).permutation(frames) for r in np.unique(rounds)}
+    picked = np.stack([shuffled[r][i] for r, i in zip(rounds, wanted % frames, strict=True)])
+    return picked.reshape(count, batch).astype(np.int32)
+
+
+def _sample(model: Model, weights: Blend, offsets, matrices, inertia_share):
+    """Energy of one sample as a function of its last frame's offsets and the skinning weights."""
+    rest = model.garment.mesh.rest
+    body = None if model.body is None else pose_body(model, matrices[0])
+    previous = before = None
+    if model.terms.inertia:
+        previous, before = (skin(blend(matrices[k], weights), rest + offsets[k]) for k in (1, 2))
+
+    def value(last, weights):
+        blended = blend(matrices[0], weights)
+        frame = Frame(1 / model.fps, previous, before, body, blended)
+        parts = energies(skin(blended, rest + last), model.garment, model.material, frame, model.terms, model.surface)
+        if model.terms.inertia:
+            parts["inertia"] = parts["inertia"] * inertia_share
+        return sum(parts.values()), parts
+
+    return value
+
+
+def _physics(model: Model, network: NCS, weights: Blend, offsets, matrices, inertia_share):
+    """Sample by sample, so that a sample's intermediates stay in cache: energies (batch,) and gradients (batch, verts, 3)."""
+
+    def one(args):
+        value = _sample(model, weights, *args)
+        if network.learn_weights:
+            (_, parts), (g, w) = jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(args[0][0], weights)
+            return parts, g, w.weights
+        (_, parts), g = jax.value_and_grad(value, has_aux=True)(args[0][0], weights)
+        return parts, g, jnp.zeros(())
+
+    parts, gradient, to_weights = lax.map(one, (offsets, matrices, inertia_share))
+    return parts, gradient, jnp.mean(to_weights, axis=0)
+
+
+def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs):
+    """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
+
+    Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample.
+    Positions before the last frame enter as constants, so only that frame is differentiated through the decoder.
+    """
+    history = 3 if model.terms.inertia else 1
+    augmented = round(spec.motion_augmentation * spec.batch) if network.dynamic is not None else 0
+
+    def codes(params):
+        z_static, z_dynamic = window_codes(network, params, track, ends, spec.window, history)
+        if z_dynamic is None:
+            return z_static
+        if not augmented:
+            return z_static + z_dynamic
+        # Motion augmentation: another window's dynamic code on this one's static code, both constants.
+        swapped = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
+        return jnp.concatenate([swapped, (z_static + z_dynamic)[:, augmented:]], axis=1)
+
+    def last_frame(params):
+        z = codes(params)
+        return decode(network, params, model, z[-1]), z
+
+    last, transpose, z = jax.vjp(last_frame, params, has_aux=True)
+    offsets = [last]
+    if history > 1:
+        earlier = decode(network, params, model, z[:-1])
+        offsets += [earlier[1], earlier[0]]
+    offsets = jnp.stack(offsets, axis=1)
+    back = jnp.maximum(ends - jnp.arange(history)[:, None], track.start[ends])
+    matrices = jnp.moveaxis(track.matrices[back], 1, 0)
+    share = (jnp.arange(ends.shape[0]) >= augmented).astype(offsets.dtype)
+    weights = garment_blend(network, params, model)
+    parts, g, to_weights = _physics(model, network, weights, offsets, matrices, share)
+    (result,) = transpose(g / ends.shape[0])
+    if network.learn_weights:
+        _, pull = jax.vjp(lambda p: garment_blend(network, p, model).weights, params)
+        result = jax.tree.map(jnp.add, result, pull(to_weights)[0])
+    return result, parts, (g, offsets)
+
+
+def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> tuple[TrainState, dict]:
+    """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
+    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs)
+    sample_good = jnp.all(jnp.isfinite(g), axis=(1, 2)) & jnp.isfinite(sum(parts.values()))
+    good = jnp.all(sample_good) & jnp.isfinite(optax.global_norm(grads))
+
+    def accept(state):
+        updates, opt = ADAM.update(grads, state.optimiser)
+        size = step_size(spec, state.step, steps)
+        return jax.tree.map(lambda p, u: p - size * u, state.params, updates), opt, state.fault
+
+    def drop(state):
+        worst = jnp.argmin(sample_good)
+        history = offsets.shape[1]
+        kept = state.fault.offsets.at[:history].set(offsets[worst])
+        return state.params, state.optimiser, Fault(state.step, ends[worst], kept)
+
+    params, opt, fault = lax.cond(good, accept, drop, state)
+    logs = {name: jnp.mean(value) for name, value in parts.items()}
+    return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
+
+
+def chunk_runner(network: NCS, spec: TrainingSpec):
+    """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
+
+    `steps` is how many the whole training has, for the schedule. The state's buffers are reused.
+    """
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def run(state, ends, pairs, steps, model, track):
+        def body(state, indices):
+            return step(model, network, spec, steps, state, track, *indices)
+
+        return lax.scan(body, state, (ends, pairs))
+
+    return run
+
+
+def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:
+    """(first step, count) of every chunk up to `steps`, cut at the multiples of CHUNK wherever a run resumes."""
+    while first < steps:
+        upto = min((first // CHUNK + 1) * CHUNK, steps)
+        yield first, upto - first
+        first = upto
+
+
+def glance(model: Model, network: NCS, window: int, params, track: Track, ends) -> dict[str, Float[Array, ""]]:
+    """Mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames."""
+    z_static, z_dynamic = window_codes(network, params, track, ends, window, 1)
+    z = z_static if z_dynamic is None else z_static + z_dynamic
+    offsets = decode(network, params, model, z[-1])
+    weights = garment_blend(network, params, model)
+    mesh = model.garment.mesh
+
+    def one(args):
+        offset, matrices = args
+        x = skin(blend(matrices, weights), mesh.rest + offset)
+        length = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
+        strain = jnp.abs(length / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+        result = {"strain": 100 * jnp.mean(strain)}
+        if model.terms.collision is not None:
+            d = distances(x, pose_body(model, matrices), model.surface, model.terms)
+            result["penetrating"] = 100 * jnp.mean(d < 0)
+        return result
+
+    return {k: jnp.mean(v) for k, v in lax.map(one, (offsets, track.matrices[ends])).items()}
+
+
+def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> str:
+    """Which term of a dropped step went non-finite, in which frame, and at which vertex first."""
+    frame = int(fault.frame)
+    history = 3 if model.terms.inertia else 1
+    back = jnp.maximum(frame - jnp.arange(history), track.start[frame])
+    weights = garment_blend(network, params, model)
+    value = _sample(model, weights, fault.offsets[:history], track.matrices[back], 1.0)
+    last = fault.offsets[0]
+    if not bool(jnp.all(jnp.isfinite(last))):
+        return f"step {int(fault.step)}, frame {frame}: the network's own output is not finite"
+    _, parts = value(last, weights)
+    for name, energy in parts.items():
+        gradient = jax.grad(lambda o, n=name: value(o, weights)[1][n])(last)
+        bad = ~np.isfinite(np.asarray(gradient)).all(axis=1)
+        if not np.isfinite(float(energy)) or bad.any():
+            vertex = int(bad.argmax()) if bad.any() else -1
+            faces = np.flatnonzero((np.asarray(model.garment.mesh.faces) == vertex).any(axis=1))
+            where = f"vertex {vertex}" + (f" (face {faces[0]})" if faces.size else "") if vertex >= 0 else "an unknown element"
+            return f"step {int(fault.step)}, frame {frame}: {name} is not finite at {where}"
+    return f"step {int(fault.step)}, frame {frame}: the gradient of the parameters is not finite"
