@@ -21,12 +21,13 @@ SHAPE = {
 }
 INFLUENCES = 4
 # Joints that share a point with their parent come after it; parents[j] < j.
-ORDER = (
-    "Hips LowerBack Spine Spine1 Neck Neck1 Head "
-    "LeftShoulder LeftArm LeftForeArm LeftHand LThumb LeftFingerBase LeftHandFinger1 "
-    "RightShoulder RightArm RightForeArm RightHand RThumb RightFingerBase RightHandFinger1 "
-    "LHipJoint LeftUpLeg LeftLeg LeftFoot LeftToeBase RHipJoint RightUpLeg RightLeg RightFoot RightToeBase"
-).split()
+ARM = ("Shoulder", "Arm", "ForeArm", "Hand", "Thumb", "FingerBase", "HandFinger1")
+LEG = ("HipJoint", "UpLeg", "Leg", "Foot", "ToeBase")
+SHORT = ("Thumb", "HipJoint")  # the rig writes LThumb, but LeftHand
+ORDER = [
+    *("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head"),
+    *((side[0] if part in SHORT else side) + part for limb in (ARM, LEG) for side in ("Left", "Right") for part in limb),
+]
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,8 @@ def load_source() -> Source:
         head = rig[name]["head"]
         index = np.unique(quads[head["cube_name"]]) if head["strategy"] == "CUBE" else head["vertex_indices"]
         joints.append(vertices[index].mean(0))
+    joints = np.array(joints)
+    joints[np.abs(joints[:, 0]) < 0.005, 0] = 0.0
     parents = np.array([ORDER.index(rig[n]["parent"]) if rig[n]["parent"] else -1 for n in ORDER], dtype=np.int32)
     table = json.loads((folder / "rigs" / "standard" / "weights.cmu_mb.json").read_text())["weights"]
     weights = np.zeros((len(vertices), len(ORDER)))
@@ -86,7 +89,7 @@ def load_source() -> Source:
     q = np.array(quads["body"])
     faces = np.concatenate([q[:, [0, 1, 2]], q[:, [0, 2, 3]]])
     weights = weights[:BODY_VERTICES]
-    return Source(vertices[:BODY_VERTICES], faces, weights / weights.sum(1, keepdims=True), np.array(joints), parents)
+    return Source(vertices[:BODY_VERTICES], faces, weights / weights.sum(1, keepdims=True), joints, parents)
 
 
 def visibility(vertices: np.ndarray, faces: np.ndarray, rays: int = 48) -> np.ndarray:
@@ -121,10 +124,11 @@ def make_body(source: Source, target: int = 6200) -> dict[str, np.ndarray]:
     bary = np.clip(bary, 0, None)
     weights = np.einsum("nk,nkj->nj", bary / bary.sum(1, keepdims=True), source.weights[source.faces[triangle]])
     weight_joints, weights = strongest(weights)
+    ground = np.array([0.0, vertices[:, 1].min(), 0.0])  # decimation moves the soles by a fraction of a millimetre
     return {
-        "vertices": _round(vertices),
+        "vertices": _round(vertices - ground),
         "faces": faces.astype(np.int32),
-        "joints": source.joints.astype(np.float32),
+        "joints": (source.joints - ground).astype(np.float32),
         "parents": source.parents.astype(np.int32),
         "weight_joints": weight_joints,
         "weights": weights,

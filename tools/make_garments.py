@@ -26,7 +26,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 def make_garments(body: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """All garments by file name."""
-    shirt, shirt_edges = _shirt(body), {"tshirt": 0.0263, "tshirt_fine": 0.0123}
+    shirt, shirt_edges = _shirt(body), {"tshirt": 0.0264, "tshirt_fine": 0.01235}
     skirt, skirt_edges = _skirt(body), {"skirt": 0.0278, "skirt_fine": 0.0130}
     out = {}
     for (surface, project), edges in ((shirt, shirt_edges), (skirt, skirt_edges)):
@@ -103,7 +103,7 @@ def _shirt(body: dict[str, np.ndarray]) -> tuple:
     bust = _joint(body, "Spine1")[1] + 0.06
     trunk = _hang(trunk, -0.10, int((bust - low[1]) / CELL))
     ease = 0.006 + 0.009 * _ramp(-points[..., 1], -shoulder[1] + 0.02, -shoulder[1] + 0.22)
-    sleeve = 0.006 + 0.016 * _ramp(reach, 0.05, 0.62)
+    sleeve = 0.006 + 0.016 * _ramp(reach, 0.05, 0.68)
     field = gaussian_filter(_smooth_min(trunk - ease, arm - sleeve, 0.035), 1.2)
 
     neck = _joint(body, "Neck")
@@ -113,7 +113,7 @@ def _shirt(body: dict[str, np.ndarray]) -> tuple:
     wanted = {
         "middle": points[..., 0],
         "hem": points[..., 1] - hem,
-        "sleeve": np.maximum(0.64 - reach, 4 * (arm - trunk)),
+        "sleeve": np.maximum(0.68 - reach, 4 * (arm - trunk - 0.03)),
         "neck": collar,
     }
     return _surface(low, field, wanted)
@@ -263,7 +263,7 @@ def _clear(vertices: np.ndarray, faces: np.ndarray, body: dict[str, np.ndarray])
         distance, _, normal = signed_distance(vertices, skin, skin_faces)
         short = np.maximum(CLEARANCE + 2e-4 - distance, 0)
         move = normal * short[:, None]
-        depth, hit, out, bary = signed_distance(near, vertices, faces, barycentric=True)
+        depth, hit, _, bary = signed_distance(near, vertices, faces, barycentric=True)
         inner = (bary > 1e-3).all(1) & (np.abs(depth) < 0.03)
         poke = np.where(inner, np.maximum(depth + UNDER_FACES + 2e-4, 0), 0)
         if short.max() < 1e-4 and poke.max() < 1e-4:

@@ -8,6 +8,7 @@ follow from hip and ankle. Flights are ballistic.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,8 +21,8 @@ FPS = 30
 FINE = 240  # Hz, the clock that motions are planned on
 GRAVITY = 9.81  # m/s^2
 REACH = 0.9955  # of the straight leg, while standing and walking
-FOOT_APART = 0.075  # m, half the distance between the ankles
-HANG = 14.0  # degrees between a hanging upper arm and the vertical
+FOOT_APART = 0.08  # m, half the distance between the ankles
+HANG = 16.0  # degrees between a hanging upper arm and the vertical
 
 Keys = list[tuple[float, float]]
 
@@ -52,10 +53,8 @@ class Plan:
     swing: float = 1.0  # how much the arms answer the feet
 
 
-CHANNELS = (
-    "lean side twist hips_side hips_twist nod look "
-    "abduct_left abduct_right flex_left flex_right elbow_left elbow_right turn_left turn_right"
-).split()
+TRUNK = ["lean", "side", "twist", "hips_side", "hips_twist", "nod", "look"]
+CHANNELS = TRUNK + [f"{move}_{key}" for move in ("abduct", "flex", "elbow", "turn") for key in ("left", "right")]
 
 
 def ease(t: np.ndarray, keys: Keys) -> np.ndarray:
@@ -71,7 +70,7 @@ def ease(t: np.ndarray, keys: Keys) -> np.ndarray:
 def quintic(t: np.ndarray, keys: list[tuple[float, float, float, float]]) -> np.ndarray:
     """Interpolation of (time, value, speed, acceleration): C2."""
     out = np.full_like(t, keys[0][1])
-    for (t0, p0, v0, a0), (t1, p1, v1, a1) in zip(keys[:-1], keys[1:], strict=True):
+    for (t0, p0, v0, a0), (t1, p1, v1, a1) in itertools.pairwise(keys):
         h = t1 - t0
         s = np.clip((t - t0) / h, 0, 1)
         rest = np.array([p1 - p0 - v0 * h - a0 * h * h / 2, (v1 - v0 - a0 * h) * h, (a1 - a0) * h * h])
@@ -152,8 +151,10 @@ def make_motion(plan: Plan, rig: Rig) -> dict[str, np.ndarray]:
     across = np.stack([course[:, 2], 0 * t, -course[:, 0]], 1)  # to the character's left
 
     feet = {side: _foot(plan, rig, side, t, path, across, heading) for side in (1, -1)}
-    swinging = {side: sum(((t > s.off) & (t < s.on) & (not s.flight)) * 1.0 for s in plan.steps if s.side == side) + 0 * t for side in (1, -1)}
-    load = _smooth(swinging[-1] - swinging[1], 0.085)  # +1: on the left foot
+    load = np.zeros_like(t)  # +1: on the left foot
+    for step in plan.steps:
+        load -= step.side * ((t > step.off) & (t < step.on) & (not step.flight))
+    load = _smooth(load, 0.085)
     stride = {side: ((feet[side]["ankle"] - path) * course).sum(1) for side in (1, -1)}
     gait = _smooth(np.clip((stride[-1] - stride[1]) / 0.62, -1.2, 1.2), 0.035)  # +1: right foot ahead
     gait_arms = _smooth(gait, 0.05) * plan.swing
@@ -167,16 +168,17 @@ def make_motion(plan: Plan, rig: Rig) -> dict[str, np.ndarray]:
 
     root = path + across * (0.024 * load)[:, None]
     root = root + course * (-0.0011 * c["lean"])[:, None]  # leaning takes the hips back
-    height = _hip_height(rig, root, hips, feet, t)
+    height = _hip_height(rig, root, hips, feet, speed)
     stand = height[0]
     if plan.height:
         arc = quintic(t, plan.height)
-        active = ease(t, [(plan.height[0][0] - 0.15, 0), (plan.height[0][0], 1), (plan.height[-1][0], 1), (plan.height[-1][0] + 0.15, 0)])
+        start, end = plan.height[0][0], plan.height[-1][0]
+        active = ease(t, [(start - 0.15, 0), (start, 1), (end, 1), (end + 0.15, 0)])
         height = height * (1 - active) + (stand + arc) * active
     root[:, 1] = height
 
     world = {"Hips": hips, "LHipJoint": hips, "RHipJoint": hips}
-    spine_yaw = c["twist"] - 1.75 * 6.0 * gait_arms - c["hips_twist"] * 0.0
+    spine_yaw = c["twist"] - 1.75 * 6.0 * gait_arms
     spine_side = c["side"] - 0.9 * hips_list
     trunk = hips
     for name, share in (("LowerBack", 0.3), ("Spine", 0.35), ("Spine1", 0.35)):
@@ -234,34 +236,40 @@ def _foot(plan: Plan, rig: Rig, side: int, t: np.ndarray, path: np.ndarray, acro
     """Ankle position (T, 3), foot rotation and toe rotation (T, 3, 3) of one foot."""
     _, _, ankle, ball = rig.leg(side)
     steps = sorted((s for s in plan.steps if s.side == side), key=lambda s: s.off)
+    turning = np.gradient(heading, t)
     place, turn = [(path[0] + side * FOOT_APART * across[0])], [heading[0]]
     for i, s in enumerate(steps):
         leave = steps[i + 1].off if i + 1 < len(steps) else s.on + (s.on - s.off) * 1.5
-        middle = s.on if s.flight else min((s.on + leave) / 2, s.on + 0.6)
+        middle = s.on if s.flight else s.on + min(0.42 * (leave - s.on), 0.6)
         k = min(int(middle * FINE), len(t) - 1)
-        place.append(path[k] + side * FOOT_APART * across[k])
+        apart = FOOT_APART + min(0.055, 0.0005 * abs(turning[k]))
+        place.append(path[k] + side * apart * across[k])
         turn.append(heading[k])
-    length = [np.linalg.norm(b - a) for a, b in zip(place[:-1], place[1:], strict=True)]
+    length = [np.linalg.norm(b - a) for a, b in itertools.pairwise(place)]
 
-    pitch, bend = [(-1.0, 0.0)], [(-1.0, 0.0)]
+    pitch, bend = [(-1.0, 0.0)], [(-1.0, 1.0)]
     for s, reach in zip(steps, length, strict=True):
-        size = min(1.0, reach / 1.1)
-        off, on = s.pitch or (-50 * size - 8, 18 * size)
+        size = min(1.0, reach / 1.05)
+        off, on = s.pitch or (-52 * size - 6, 18 * size)
         span = s.on - s.off
-        pitch += [(max(s.off - 0.45 * span, pitch[-1][0] + 0.02), 0), (s.off - 0.12 * span, 0.62 * off), (s.off + 0.05 * span, off)]
-        bend += [(max(s.off - 0.45 * span, bend[-1][0] + 0.02), 0), (s.off - 0.12 * span, 0.62), (s.off + 0.02 * span, 0.85)]
+        rise = 0.25 if s.flight else 0.30
+        pitch += [(max(s.off - rise, pitch[-1][0] + 0.02), 0), (s.off - 0.45 * rise, 0.48 * off), (s.off + 0.02, off)]
+        bend += [(max(s.off - rise, bend[-1][0] + 0.02), 1.0), (s.off + 0.02, 0.97)]
         if s.flight:
             pitch += [(s.off + 0.5 * span, 0.75 * off), (s.on, on), (s.on + 0.12, 0)]
-            bend += [(s.off + 0.3 * span, 0.1), (s.on - 0.08, 0.15), (s.on, 0.9), (s.on + 0.12, 0.0)]
+            bend += [(s.off + 0.3 * span, 0.1), (s.on - 0.08, 0.3), (s.on, 1.0), (s.on + 0.12, 1.0)]
         else:
             pitch += [(s.off + 0.45 * span, 0.25 * off), (s.off + 0.8 * span, on), (s.on, on), (s.on + 0.22 * span, 0)]
-            bend += [(s.off + 0.35 * span, 0.0), (s.on, 0.0)]
+            bend += [(s.off + 0.4 * span, 0.15), (s.off + 0.8 * span, 0.1), (s.on, 1.0)]
     pitch.append((t[-1] + 2, 0.0))
-    bend.append((t[-1] + 2, 0.0))
+    bend.append((t[-1] + 2, 1.0))
     pitch_t = _smooth(PchipInterpolator(*np.array(pitch).T)(t), 0.012)
     bend_t = _smooth(PchipInterpolator(*np.array(bend).T)(t), 0.012) * np.minimum(pitch_t, 0)
 
-    yaw = ease(t, [(-1.0, turn[0]), *(k for s, a, b in zip(steps, turn[:-1], turn[1:], strict=True) for k in ((s.off, a), (s.on, b)))])
+    turns = [(-1.0, turn[0])]
+    for s, a, b in zip(steps, turn[:-1], turn[1:], strict=True):
+        turns += [(s.off, a), (s.on, b)]
+    yaw = ease(t, turns)
     foot = _rot("y", yaw) @ _rot("x", -pitch_t)
     toe = foot @ _rot("x", bend_t)
 
@@ -281,7 +289,7 @@ def _foot(plan: Plan, rig: Rig, side: int, t: np.ndarray, path: np.ndarray, acro
     lift = np.zeros_like(t)
     for i, s in enumerate(steps):
         before, after = position, standing(place[i + 1])
-        a, b = int(round(s.off * FINE)), min(int(round(s.on * FINE)), len(t) - 1)
+        a, b = round(s.off * FINE), min(round(s.on * FINE), len(t) - 1)
         if a >= len(t):
             break
         u = slice(a, b + 1)
@@ -289,19 +297,21 @@ def _foot(plan: Plan, rig: Rig, side: int, t: np.ndarray, path: np.ndarray, acro
             lift[u] = GRAVITY / 2 * (t[u] - s.off) * (s.on - t[u])
         else:
             r = np.clip((t[u] - s.off) / (s.on - s.off), 0, 1)
-            lift[u] = s.lift * 16 * (r * (1 - r)) ** 2 * (1.25 - 0.5 * r)
+            lift[u] = s.lift * np.sin(np.pi * r) ** 1.4 * (1.25 - 0.5 * r)
         speed0 = (before[a] - before[max(a - 2, 0)]) * FINE / 2
         speed1 = (after[min(b + 2, len(t) - 1)] - after[b]) * FINE / 2
         swing = np.stack(
             [quintic(t[u], [(s.off, before[a, k], speed0[k], 0), (s.on, after[b, k], speed1[k], 0)]) for k in range(3)], 1
         )
+        veer = min(1.0, abs(turn[i + 1] - turn[i]) / 45)  # round the standing leg in a turn
+        swing += side * 0.06 * veer * np.sin(np.pi * np.clip((t[u] - s.off) / (s.on - s.off), 0, 1))[:, None] ** 2 * across[u]
         position = np.concatenate([position[:a], swing, after[b + 1 :]])
     position[:, 1] = lift - rig.foot_bottom(side, foot, toe)
     position[:, 1] = np.where(lift > 0, _smooth(position[:, 1], 0.008), position[:, 1])
     return {"ankle": position, "foot": foot, "toe": toe, "yaw": yaw, "lift": lift}
 
 
-def _hip_height(rig: Rig, root: np.ndarray, hips: np.ndarray, feet: dict, t: np.ndarray) -> np.ndarray:
+def _hip_height(rig: Rig, root: np.ndarray, hips: np.ndarray, feet: dict, speed: np.ndarray) -> np.ndarray:
     """The highest smooth root height (T,) that both legs can reach."""
     allowed = []
     for side in (1, -1):
@@ -312,8 +322,9 @@ def _hip_height(rig: Rig, root: np.ndarray, hips: np.ndarray, feet: dict, t: np.
         flat = np.minimum(gap[:, 0] ** 2 + gap[:, 2] ** 2, (0.9 * length) ** 2)
         allowed.append(feet[side]["ankle"][:, 1] + np.sqrt(length**2 - flat) - offset[:, 1])
     a, b = allowed
-    low = np.minimum(a, b) - 0.012 * np.exp(-(((a - b) / 0.03) ** 2)) * 0.0
+    low = np.minimum(a, b)
     smooth = _smooth(low, 0.05)
+    smooth = smooth - 0.010 * np.clip(speed, 0, 1)
     for _ in range(20):
         excess = np.maximum(smooth - low, 0)
         if excess.max() < 5e-4:
@@ -358,7 +369,7 @@ def _arm(world: dict, rig: Rig, side: int, c: dict[str, np.ndarray], swing: np.n
     abduct = HANG + c[f"abduct_{key}"]
     flex = 3 + 20 * swing + c[f"flex_{key}"]
     bend = 16 + 9 * swing + c[f"elbow_{key}"]
-    inward = 18 + c[f"turn_{key}"]
+    inward = 10 + c[f"turn_{key}"]
     raised = abduct - rest_abduction
     collar = np.where(raised > 0, 0.26 * raised, 0.10 * raised)
     collar = _smooth(collar, 0.03) + 0.08 * np.clip(flex - 60, 0, None)
@@ -373,29 +384,28 @@ def _arm(world: dict, rig: Rig, side: int, c: dict[str, np.ndarray], swing: np.n
 
 def walking(start: float, count: int, pace: float, first: int = 1, swing: float = 0.78) -> list[Step]:
     """Alternate steps, one every `pace` seconds."""
-    return [
-        Step(first * (-1) ** k, start + k * pace, start + (k + swing) * pace) for k in range(count)
-    ]
+    return [Step(first * (-1) ** k, start + k * pace, start + (k + swing) * pace) for k in range(count)]
 
 
 def jump(at: float, up: float) -> tuple[list[Step], list[tuple[float, float, float, float]], dict[str, Keys]]:
     """A standing jump: crouch from `at`, take off 0.8 s later, rise by `up` metres."""
     v = np.sqrt(2 * GRAVITY * up)
+    tall, reach = 0.068, 0.045  # m over standing, at take-off and on landing
+    down = np.sqrt(v**2 + 2 * GRAVITY * (tall - reach))
     off = at + 0.8
-    on = off + 2 * v / GRAVITY
+    on = off + (v + down) / GRAVITY
     steps = [Step(side, off, on, flight=True, pitch=(-52, -30)) for side in (1, -1)]
-    tall = 0.045
     height = [
         (at, 0, 0, 0),
         (off - 0.27, -0.23, 0, 9.0),
         (off, tall, v, -GRAVITY),
-        (on, tall, -v, -GRAVITY),
+        (on, reach, -down, -GRAVITY),
         (on + 0.24, -0.20, 0, 4.0),
         (on + 1.0, 0, 0, 0),
     ]
-    arms = [(at, 0), (off - 0.25, -38), (off + 0.08, 95), (on - 0.02, 55), (on + 0.3, 8), (on + 0.9, 0)]
-    elbows = [(at, 0), (off - 0.25, 10), (off + 0.05, 40), (on, 35), (on + 0.3, 25), (on + 0.9, 0)]
-    wide = [(at, 0), (off - 0.25, 6), (off + 0.08, 14), (on, 26), (on + 0.35, 12), (on + 0.9, 0)]
+    arms = [(at, 0), (off - 0.38, -34), (off + 0.14, 88), (on + 0.28, 8), (on + 0.9, 0)]
+    elbows = [(at, 0), (off - 0.38, 8), (off + 0.14, 38), (on + 0.28, 24), (on + 0.9, 0)]
+    wide = [(at, 0), (off - 0.38, 8), (off + 0.14, 16), (on, 26), (on + 0.35, 14), (on + 0.9, 0)]
     lean = [(at, 0), (off - 0.25, 42), (off + 0.02, 2), (on - 0.05, 8), (on + 0.25, 36), (on + 0.95, 0)]
     channels = {"lean": lean}
     for key in ("left", "right"):
@@ -411,19 +421,22 @@ def plans() -> dict[str, Plan]:
     """All packaged motions."""
     out = {}
     out["stand"] = Plan(4.0, waves={"hips_side": [(0.3, 3.7, 1.2, 0.3)], "lean": [(0.3, 3.7, 1.5, 0.3)]})
-    out["walk"] = Plan(6.0, walking(0.35, 12, 0.5), speed=[(0.2, 0), (1.2, 1.2)])
+    out["walk"] = Plan(6.5, walking(0.5, 12, 0.5), speed=[(0.35, 0), (1.35, 1.1)])
     out["walk_turn_stop"] = Plan(
-        7.5,
-        walking(0.35, 10, 0.5),
-        speed=[(0.2, 0), (1.1, 1.15), (1.7, 1.15), (2.4, 0.65), (3.4, 0.65), (4.2, 1.15), (4.75, 1.15), (5.15, 0)],
-        heading=[(1.9, 0), (3.9, 180)],
+        8.0,
+        walking(0.5, 10, 0.5),
+        speed=[(0.35, 0), (1.25, 1.1), (1.75, 1.1), (2.45, 0.65), (3.65, 0.65), (4.35, 1.1), (4.9, 1.1), (5.3, 0)],
+        heading=[(1.85, 0), (4.25, 180)],
     )
     steps, height, channels = jump(0.5, 0.26)
     out["jump"] = Plan(4.5, steps, height=height, channels=channels)
     out["twist"] = Plan(
         6.0,
         waves={"twist": [(0.4, 3.9, 38, 0.9)], "hips_twist": [(0.4, 3.9, 12, 0.9)]},
-        channels=_both("abduct", [(0.1, 0), (0.9, 28), (3.6, 28), (4.4, 0)]) | _both("elbow", [(0.1, 0), (0.9, 25), (3.6, 25), (4.4, 0)]),
+        channels={
+            **_both("abduct", [(0.1, 0), (0.9, 28), (3.6, 28), (4.4, 0)]),
+            **_both("elbow", [(0.1, 0), (0.9, 25), (3.6, 25), (4.4, 0)]),
+        },
     )
     lift = [(0.4, 0), (1.6, 138), (2.1, 138), (3.2, 0), (3.6, 0), (4.4, 138), (4.7, 138), (5.6, 0)]
     out["lift_arms"] = Plan(6.5, channels=_both("abduct", lift) | _both("turn", [(k, -0.35 * v) for k, v in lift]))
@@ -433,37 +446,37 @@ def plans() -> dict[str, Plan]:
 
 
 def _dance() -> Plan:
-    steps = walking(0.5, 4, 0.5) + walking(2.7, 6, 0.36) + walking(5.2, 3, 0.5, first=-1)
+    steps = walking(0.5, 4, 0.5) + walking(2.5, 10, 0.31) + walking(5.8, 2, 0.5)
     return Plan(
         7.5,
         steps,
-        heading=[(2.6, 0), (4.8, 360)],
+        heading=[(2.4, 0), (5.6, 360)],
         waves={
-            "hips_side": [(0.3, 2.7, 6, 1.0), (5.0, 7.0, 6, 1.0)],
-            "twist": [(0.3, 2.7, 14, 1.0), (5.0, 7.0, 14, 1.0)],
+            "hips_side": [(0.3, 2.7, 6, 1.0), (5.4, 7.1, 6, 1.0)],
+            "twist": [(0.3, 2.7, 14, 1.0), (5.4, 7.1, 14, 1.0)],
             "side": [(0.3, 2.7, -6, 1.0)],
             "flex_left": [(0.3, 2.7, 18, 1.0)],
             "flex_right": [(0.3, 2.7, -18, 1.0)],
         },
-        channels=_both("abduct", [(0.2, 0), (1.0, 22), (2.4, 22), (3.2, 68), (4.5, 68), (5.3, 30), (6.6, 20), (7.2, 0)])
-        | _both("elbow", [(0.2, 0), (1.0, 45), (2.4, 45), (3.2, 18), (4.5, 18), (5.3, 50), (6.6, 35), (7.2, 0)]),
+        channels=_both("abduct", [(0.2, 0), (1.0, 22), (2.4, 22), (3.2, 68), (4.9, 68), (5.7, 30), (6.6, 20), (7.2, 0)])
+        | _both("elbow", [(0.2, 0), (1.0, 45), (2.4, 45), (3.2, 18), (4.9, 18), (5.7, 50), (6.6, 35), (7.2, 0)]),
         swing=0.3,
     )
 
 
 def _mixed() -> Plan:
-    steps, height, channels = jump(4.0, 0.2)
+    steps, height, channels = jump(4.1, 0.2)
     arms = channels | {
-        f"abduct_{key}": [*channels[f"abduct_{key}"], (6.0, 0), (6.9, 120), (7.1, 120), (7.9, 0)] for key in ("left", "right")
+        f"abduct_{key}": [*channels[f"abduct_{key}"], (6.1, 0), (6.9, 120), (7.1, 120), (7.9, 0)] for key in ("left", "right")
     }
     return Plan(
         8.0,
-        walking(0.3, 7, 0.48) + steps,
-        speed=[(0.15, 0), (0.9, 1.15), (2.9, 1.0), (3.3, 0)],
-        heading=[(1.2, 0), (2.9, -100)],
+        walking(0.45, 7, 0.48) + steps,
+        speed=[(0.3, 0), (1.05, 1.1), (3.0, 1.0), (3.4, 0)],
+        heading=[(1.3, 0), (3.0, -100)],
         height=height,
         channels=arms,
-        waves={"twist": [(6.0, 7.9, 25, 1.1)]},
+        waves={"twist": [(6.1, 7.9, 25, 1.1)]},
     )
 
 

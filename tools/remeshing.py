@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["Surgery", "clip", "decimate", "remesh", "mirror", "compact", "vertex_normals", "triangle_quality"]
+__all__ = ["Surgery", "clip", "compact", "decimate", "mirror", "remesh", "triangle_quality", "vertex_normals"]
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -296,6 +296,11 @@ def remesh(
                 if rim is not None:
                     mesh.points[new] = _to_polyline(middle, curves[rim])[0]
                     label[min(a, new), max(a, new)] = label[min(b, new), max(b, new)] = rim
+        for v in range(len(mesh.points)):  # a vertex inside a triangle
+            if len(mesh.star[v]) == 3 and not mesh.is_rim(v):
+                keep = min(mesh.ring(v))
+                if len(mesh.around(*(mesh.ring(v) - {keep}))) == 1:
+                    mesh.collapse(keep, v, mesh.points[keep])
         for a, b in mesh.edges():  # collapse
             if not mesh.around(a, b):
                 continue
@@ -327,7 +332,27 @@ def remesh(
     for _ in range(4):
         _equalise(mesh)
         _relax(mesh, label, curves, is_corner, project)
+    for _ in range(3):
+        _sharpen(mesh)
+        _relax(mesh, label, curves, is_corner, project)
+    _sharpen(mesh)
     return mesh.arrays()
+
+
+def _sharpen(mesh: Surgery) -> None:
+    """Flip edges where that opens the smallest angle (Delaunay)."""
+
+    def apex(c: int, a: int, b: int) -> float:
+        u, v = mesh.points[a] - mesh.points[c], mesh.points[b] - mesh.points[c]
+        w = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+        return float(np.arctan2(np.sqrt(w @ w), u @ v))
+
+    for a, b in mesh.edges():
+        shared = mesh.around(a, b)
+        if len(shared) == 2:
+            c, d = (mesh.opposite(f, a, b) for f in shared)
+            if apex(c, a, b) + apex(d, a, b) > np.pi + 0.05:
+                mesh.flip(a, b, 0.5)
 
 
 def _equalise(mesh: Surgery) -> None:
