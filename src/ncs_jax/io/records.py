@@ -1,0 +1,72 @@
+"""What the readers return: plain NumPy arrays, already checked, in metres and seconds unless a field says otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["AnimationRecord", "BodyRecord", "GarmentRecord", "MotionRecord"]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyRecord:
+    """A skinned character in its rest pose.
+
+    Attributes:
+        vertices: (V, 3) rest positions, m. faces: (F, 3) int32. joints: (J, 3) global rest positions, m.
+        parents: (J,) int32 with parents[j] < j, and -1 for joint 0, the root. weights: (V, J) skinning weights, not negative;
+            every row sums to 1. joint_names: J names, or none. rest_rotations: (J, 3, 3) rotations of the joints in the rest
+            pose, or None for the identity.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    joints: np.ndarray
+    parents: np.ndarray
+    weights: np.ndarray
+    joint_names: tuple[str, ...] = ()
+    rest_rotations: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentRecord:
+    """A garment in its rest shape on the resting body: an oriented manifold triangle mesh, usually with boundary.
+
+    Attributes:
+        vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
+            or a vertex has several. groups: named vertex sets, each sorted int32.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None = None
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRecord:
+    """What the skeleton does.
+
+    Attributes:
+        poses: (T, J, 3) local rotations since rest, axis times angle, rad. translation: (T, 3) of the root since rest, m.
+        fps: frames per second. joint_names: J names, or none.
+    """
+
+    poses: np.ndarray
+    translation: np.ndarray
+    fps: float
+    joint_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class AnimationRecord:
+    """A moving mesh.
+
+    Attributes:
+        vertices: (T, V, 3) float32, m. faces: (F, 3) int32; no rows where the file has none. fps: frames per second.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    fps: float
