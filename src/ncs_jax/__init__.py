@@ -1,0 +1,30 @@
+"""Neural cloth simulation in JAX: a garment learns to move on an animated character from the physics energy alone."""
+
+from ncs_jax.assembly import Assembly, assemble
+from ncs_jax.errors import InputError
+from ncs_jax.evaluation import measure, summarise
+from ncs_jax.model import Model
+from ncs_jax.objective import energies, total
+from ncs_jax.rollout import animate, stepper
+from ncs_jax.runs import Report, Run, load_run, train
+from ncs_jax.scene import Scene, load_scene, scene_from
+
+__all__ = [
+    "Assembly",
+    "InputError",
+    "Model",
+    "Report",
+    "Run",
+    "Scene",
+    "animate",
+    "assemble",
+    "energies",
+    "load_run",
+    "load_scene",
+    "measure",
+    "scene_from",
+    "stepper",
+    "summarise",
+    "total",
+    "train",
+]

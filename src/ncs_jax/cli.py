@@ -26,6 +26,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit code is 0, or 2 for input that cannot be used, or 130 when interrupted."""
     parsed = _parser().parse_args(arguments)
+    _keep_compiled_programs()
     try:
         return parsed.run(parsed)
     except InputError as error:
@@ -78,6 +79,16 @@ def _parser() -> argparse.ArgumentParser:
     check = command("check", _check, "read and assemble a scene without training it")
     check.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME")
     return parser
+
+
+def _keep_compiled_programs() -> None:
+    """A second run need not compile again; JAX_COMPILATION_CACHE_DIR, if set, says where."""
+    import jax
+
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ncs-jax"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def _positive(text: str) -> float:
@@ -277,4 +288,4 @@ def _clearance(model) -> float:
 
 
 if __name__ == "__main__":
-    os._exit(main())
+    sys.exit(main())

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ncs_jax.energies.collision import Surface, surface_from
-from ncs_jax.kinematics import Blend, Skeleton, blend, forward, skin, transforms
+from ncs_jax.energies.collision import Surface, closest_weights, nearest_triangle, surface_from
+from ncs_jax.kinematics import Blend, Skeleton, blend, forward, skin, to_rest_axes, transforms
 from ncs_jax.objective import Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix
 
-__all__ = ["Model", "pose_body", "smooth_weights", "touchable", "transfer_weights", "used_joints"]
+__all__ = ["Model", "local_rotations", "pose_body", "smooth_weights", "touchable", "transfer_weights", "used_joints"]
 
 
 @jax.tree_util.register_dataclass
@@ -51,15 +51,16 @@ def pose_body(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Skinning weights (verts, joints) of each garment vertex, interpolated at the nearest point of the body's **surface**."""
-    from ncs_jax.energies.collision import _closest_weights, nearest_triangle
-
     surface = surface_from(garment, body, faces)
-    with jax.enable_x64(True):
-        x, b = jnp.asarray(garment, jnp.float64), jnp.asarray(body, jnp.float64)
-        index = jax.jit(lambda x, b, s: nearest_triangle(x, b, s)[0])(x, b, surface)
-        corners = np.asarray(surface.faces)[np.asarray(index)]
-        barycentric = np.asarray(_closest_weights(x, b[corners]))
-    return np.einsum("vk,vkj->vj", barycentric, np.asarray(weights)[corners])
+
+    @jax.jit
+    def nearest(x, body, surface):
+        index, _ = nearest_triangle(x, body, surface)
+        return index, closest_weights(x, body[surface.faces[index]])
+
+    x, points = jnp.asarray(garment, jnp.float32), jnp.asarray(body, jnp.float32)
+    index, barycentric = nearest(x, points, surface)
+    return np.einsum("vk,vkj->vj", np.asarray(barycentric, np.float64), np.asarray(weights)[faces[np.asarray(index)]])
 
 
 def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.ndarray:
@@ -117,9 +118,8 @@ def used_joints(parents: Sequence[int], weights: np.ndarray, least: float = 0.01
     return tuple(sorted(wanted | {list(parents).index(-1)}))
 
 
+@jax.jit
 def local_rotations(model: Model, poses: Float[Array, "*frames all 3"]) -> Float[Array, "*frames joints 3 3"]:
     """Local rotation matrices, along the world's axes at rest, of the joints that matter, from axis-angle poses of all."""
-    from ncs_jax.kinematics import to_rest_axes
-
     local = axis_angle_to_matrix(poses[..., np.asarray(model.source_joints), :])
     return local if model.rest_rotations is None else to_rest_axes(local, model.rest_rotations)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -95,6 +98,7 @@ def slerp(p: Float[Array, "*rows 4"], q: Float[Array, "*rows 4"], t: Float[Array
     return mixed / jnp.sqrt(jnp.sum(mixed * mixed, axis=-1, keepdims=True))
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3))
 def resample(
     poses: Float[Array, "frames joints 3"],
     translation: Float[Array, "frames 3"],

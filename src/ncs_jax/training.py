@@ -72,10 +72,9 @@ def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
 def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
     """Fresh parameters and a fresh optimiser."""
     params = initial_parameters(network, jax.random.PRNGKey(seed), model)
-    zero = jnp.zeros((), jnp.int32)
-    fault = Fault(zero - 1, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
-    # Copies: the two counters must not share a buffer that a step is given to reuse.
-    return TrainState(params, ADAM.init(params), zero, jnp.zeros((), jnp.int32), fault)
+    count = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one buffer each: a step is given them to reuse
+    fault = Fault(count(), count(), jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
+    return TrainState(params, ADAM.init(params), count(), count(), fault)
 
 
 def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:

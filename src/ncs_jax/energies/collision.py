@@ -19,6 +19,7 @@ from ncs_jax.numerics import angle_between, normalize
 
 __all__ = [
     "Surface",
+    "closest_weights",
     "collision",
     "face_normals",
     "nearest_triangle",
@@ -43,6 +44,7 @@ class Surface:
     rings: Int[Array, "body most"]
     face_edges: Int[Array, "faces 3"]
     edge_sides: Int[Array, "edges 2"]
+    border: Bool[Array, "body"]  # on the rim where the touchable part was cut out of the body
     cloth_blocks: Int[Array, "blocks size"]
     cloth_place: Int[Array, "verts"]
     vertex_blocks: Int[Array, "clusters vertices"]
@@ -79,13 +81,18 @@ def surface_from(
     place = np.zeros(len(cloth), np.int32)
     place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
     edges, sides, _ = topology(faces)
-    key = {tuple(sorted(e)): i for i, e in enumerate(edges.tolist())}
-    face_edges = [[key[tuple(sorted((f[i], f[(i + 1) % 3])))] for i in range(3)] for f in faces.tolist()]
+    key = np.sort(edges, axis=1) @ [len(body), 1]
+    order = np.argsort(key)
+    wanted = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [len(body), 1]
+    face_edges = order[np.searchsorted(key[order], wanted)]
+    border = np.zeros(len(body), bool)
+    border[edges[sides[:, 1] < 0]] = True
     return Surface(
         faces=jnp.asarray(faces, jnp.int32),
         rings=jnp.asarray(vertex_rings(faces, len(body))),
-        face_edges=jnp.asarray(np.asarray(face_edges, np.int32).reshape(-1, 3)),
+        face_edges=jnp.asarray(face_edges, jnp.int32),
         edge_sides=jnp.asarray(sides),
+        border=jnp.asarray(border),
         cloth_blocks=jnp.asarray(cloth_blocks),
         cloth_place=jnp.asarray(place),
         vertex_blocks=jnp.asarray(_blocks(body, body_size)),
@@ -254,11 +261,11 @@ def triangle_distance(
         d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
 
     The sign comes from the pseudo-normal of the feature that holds c (face, edge or vertex), which alone is right at
-    edges and vertices. The closest point and n are constants to the derivative, which is exact to first order; on the
+    edges and vertices. On the rim of a touchable part, where the body goes on unseen, everything counts as outside. The closest point and n are constants to the derivative, which is exact to first order; on the
     surface itself n is the pseudo-normal. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
     """
     corners = lax.stop_gradient(body)[surface.faces[index]]
-    weights = _closest_weights(lax.stop_gradient(x), corners)
+    weights = closest_weights(lax.stop_gradient(x), corners)
     moving = body[surface.faces[index]]
     closest = jnp.sum(weights[..., None] * moving, axis=1)
     normal = _pseudo_normal(lax.stop_gradient(body), surface, index, weights)
@@ -266,11 +273,13 @@ def triangle_distance(
     length = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
     touching = length < 1e-7  # m: the rounding of a float32 position at 1 m
     side = jnp.sign(jnp.sum(away * normal, axis=-1, keepdims=True))
+    rim = jnp.all(surface.border[surface.faces[index]] | (weights <= 0), axis=-1, keepdims=True)
+    side = jnp.where(rim, 1, side)
     direction = jnp.where(touching | (side == 0), normal, side * away / jnp.where(touching, 1, length))
     return jnp.sum(direction * (x - closest), axis=-1)
 
 
-def _closest_weights(x, corners):
+def closest_weights(x, corners):
     """Barycentric coordinates (verts, 3) of the closest point of each triangle."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, bc = b - a, c - a, c - b
