@@ -13,7 +13,7 @@ import numpy as np
 from distance import signed_distance
 from make_body import ORDER
 from remeshing import clip, mirror, remesh, vertex_normals
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
 CELL = 0.008  # m
@@ -26,7 +26,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 def make_garments(body: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """All garments by file name."""
-    shirt, shirt_edges = _shirt(body), {"tshirt": 0.0264, "tshirt_fine": 0.01235}
+    shirt, shirt_edges = _shirt(body), {"tshirt": 0.0260, "tshirt_fine": 0.01225}
     skirt, skirt_edges = _skirt(body), {"skirt": 0.0278, "skirt_fine": 0.0130}
     out = {}
     for (surface, project), edges in ((shirt, shirt_edges), (skirt, skirt_edges)):
@@ -88,6 +88,12 @@ def _hang(field: np.ndarray, spread: float, start: int) -> np.ndarray:
     return out
 
 
+def _closing(field: np.ndarray, radius: float) -> np.ndarray:
+    """Fill what a ball of the radius (m) cannot get into, as cloth spans hollows."""
+    distance, (i, j, k) = distance_transform_edt(field <= radius, return_indices=True)
+    return np.minimum(field, radius - (distance * CELL - (field[i, j, k] - radius)))
+
+
 def _ramp(x: np.ndarray, low: float, high: float) -> np.ndarray:
     s = np.clip((x - low) / (high - low), 0, 1)
     return s * s * (3 - 2 * s)
@@ -101,13 +107,15 @@ def _shirt(body: dict[str, np.ndarray]) -> tuple:
     along = (elbow - shoulder) / np.linalg.norm(elbow - shoulder)
     reach = (points - shoulder) @ along / np.linalg.norm(elbow - shoulder)
     bust = _joint(body, "Spine1")[1] + 0.06
+    below = _ramp(-points[..., 1], -bust - 0.04, -bust + 0.10)
+    trunk = trunk * (1 - below) + _closing(trunk, 0.07) * below
     trunk = _hang(trunk, -0.10, int((bust - low[1]) / CELL))
     ease = 0.006 + 0.009 * _ramp(-points[..., 1], -shoulder[1] + 0.02, -shoulder[1] + 0.22)
     sleeve = 0.006 + 0.016 * _ramp(reach, 0.05, 0.68)
     field = gaussian_filter(_smooth_min(trunk - ease, arm - sleeve, 0.035), 1.2)
 
     neck = _joint(body, "Neck")
-    hem = 0.795
+    hem = 0.805
     front = _ramp(points[..., 2], neck[2] - 0.05, neck[2] + 0.06)
     collar = neck[1] + 0.030 - points[..., 1] - 0.055 * front + 0.9 * np.maximum(np.abs(points[..., 0]) - 0.055, 0)
     wanted = {

@@ -22,7 +22,7 @@ FINE = 240  # Hz, the clock that motions are planned on
 GRAVITY = 9.81  # m/s^2
 REACH = 0.9955  # of the straight leg, while standing and walking
 FOOT_APART = 0.08  # m, half the distance between the ankles
-HANG = 16.0  # degrees between a hanging upper arm and the vertical
+HANG = 18.0  # degrees between a hanging upper arm and the vertical
 
 Keys = list[tuple[float, float]]
 
