@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,35 +16,42 @@ from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
 from ncs_jax.model import Model, local_rotations, smooth_weights, touchable, transfer_weights, used_joints
 from ncs_jax.modes import modal_basis
-from ncs_jax.motion import Track, join, mirror, track
+from ncs_jax.motion import Track, mirror, track
 from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
 from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix, resample
 from ncs_jax.scene import Scene
 
-__all__ = ["Assembly", "assemble", "load_motion", "mirror_partners", "track_of"]
+__all__ = ["Assembly", "Prepared", "assemble", "load_motion", "mirror_partners", "track_of"]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What is found out once from the files of a scene and then kept with a run.
+
+    inputs: joints that the network reads, the root first. moves: whether the character ever moves. weights: the garment's
+    skinning weights (verts, joints). part: the body vertices that the garment can touch. basis: its smooth modes, m.
+    """
+
+    inputs: np.ndarray
+    moves: np.ndarray
+    weights: np.ndarray
+    part: np.ndarray
+    basis: np.ndarray
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A scene made ready. `body` and `garment` are the records as read; `train` and `validation` are tracks by motion name."""
+    """A scene made ready. `body` and `garment` are the records as read; `track` holds all training motions end to end."""
 
     scene: Scene
+    prepared: Prepared
     model: Model
     network: NCS
     body: io.BodyRecord | None
     garment: io.GarmentRecord
-    train: dict[str, Track]
-    validation: dict[str, Track]
-
-    @property
-    def track(self) -> Track:
-        """All training motions end to end."""
-        return join(list(self.train.values()))
-
-
-def _read_body(scene: Scene) -> io.BodyRecord | None:
-    return None if scene.body.file in ("", "none") else io.read_body(scene.path(scene.body.file))
+    track: Track | None
+    motions: dict[str, io.MotionRecord]
 
 
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
@@ -69,9 +77,11 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
             "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
             mend="divide centimetres by 100",
         )  # fmt: skip
-    poses, translation = resample(
-        jnp.asarray(poses, jnp.float32), jnp.asarray(record.translation, jnp.float32), record.fps, scene.motion.fps
-    )
+    translation = record.translation
+    if record.fps != scene.motion.fps:
+        poses, translation = resample(
+            jnp.asarray(poses, jnp.float32), jnp.asarray(translation, jnp.float32), float(record.fps), scene.motion.fps
+        )
     return io.MotionRecord(np.asarray(poses), np.asarray(translation), scene.motion.fps, record.joint_names)
 
 
@@ -132,118 +142,131 @@ def _inputs(scene: Scene, body: io.BodyRecord, wanted: tuple[int, ...]) -> tuple
     return (root, *sorted(set(chosen) - {root}))
 
 
-def assemble(scene: Scene, *, motions: bool = True, moves: bool | None = None, dtype=jnp.float32) -> Assembly:
+def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float32) -> Assembly:
     """Read every file of a scene, check that they fit together, and precompute all that does not change.
 
     Args:
-        scene: from `load_scene`. motions: False leaves the motions unread (to animate a trained garment).
+        scene: from `load_scene`. prepared: of a run, which needs no training motion any more; else found out here.
         dtype: of everything; float64 needs JAX's x64 mode.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
-    body, garment = _read_body(scene), io.read_garment(scene.path(scene.garment.file))
+    body = None if scene.body.file in ("", "none") else io.read_body(scene.path(scene.body.file))
+    garment = io.read_garment(scene.path(scene.garment.file))
     if body is not None:
         _check_fit(scene, garment, body)
-    physics = scene.physics
-    collides = body is not None and physics.collision.stiffness > 0
-    names = (*(scene.motion.files if motions else ()), *(scene.motion.validation if motions else ()))
-    records = {name: load_motion(scene, name, body) for name in dict.fromkeys(names)}
-    train_names = scene.motion.files if motions else ()
-    if moves is None:
-        still = [np.all(r.poses == r.poses[:1]) and np.all(r.translation == r.translation[:1]) for r in records.values()]
-        moves = not all(still)
     pins = _pins(scene, garment)
     mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
-
-    if body is None:
-        parents, joints, rest_rotations = np.array([-1]), np.zeros((1, 3)), None
-        weights, part = np.ones((len(garment.vertices), 1)), np.zeros(0, int)
+    motions, track = {}, None
+    if prepared is None:
+        motions = {name: load_motion(scene, name, body) for name in (*scene.motion.files, *scene.motion.validation)}
+        prepared = _prepare(scene, body, garment, mesh, [motions[name] for name in scene.motion.files])
+        model = _model(scene, prepared, body, garment, mesh, pins, dtype)
+        track = _training_track(scene, model, body, [motions[name] for name in scene.motion.files])
     else:
-        parents, joints, rest_rotations = np.asarray(body.parents), body.joints, body.rest_rotations
-        weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
-        weights = smooth_weights(weights, np.asarray(mesh.edges), scene.garment.smoothing)
-        part = (
-            _part(scene, body, garment, parents, weights, [records[n] for n in train_names]) if collides else np.zeros(0, int)
-        )
-    relevant = np.concatenate([weights, body.weights[part]]) if collides else weights
-    inputs = used_joints(parents.tolist(), relevant)
+        model = _model(scene, prepared, body, garment, mesh, pins, dtype)
+    return Assembly(scene, prepared, model, _network(scene, model), body, garment, track, motions)
+
+
+def _prepare(scene, body, garment, mesh, records) -> Prepared:
+    moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in records)
+    count = min(scene.network.modes, len(garment.vertices) - 1)
+    basis = np.zeros((len(garment.vertices), 0), np.float32)
+    if count:
+        basis = modal_basis(garment.vertices, garment.faces, np.asarray(mesh.vertex_area), count)
+    if body is None:
+        weights = np.ones((len(garment.vertices), 1), np.float32)
+        return Prepared(np.zeros(1, np.int64), np.asarray(moves), weights, np.zeros(0, np.int64), basis)
+    weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+    weights = smooth_weights(weights, np.asarray(mesh.edges), scene.garment.smoothing)
+    part = np.zeros(0, np.int64)
+    if scene.physics.collision.stiffness > 0:
+        part = _part(scene, body, garment, weights, records)
+    wanted = used_joints(body.parents.tolist(), np.concatenate([weights, body.weights[part]]))
+    if moves:  # a joint that never turns tells the network nothing
+        turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in records], axis=0)
+        wanted = tuple(j for j in wanted if turning[j] or body.parents[j] < 0)
+    inputs = _inputs(scene, body, wanted)
+    return Prepared(np.asarray(inputs), np.asarray(moves), weights.astype(np.float32), part, basis)
+
+
+def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model:
+    physics = scene.physics
+    parents, joints, rest_rotations, body_weights = np.array([-1]), np.zeros((1, 3)), None, np.zeros((0, 1))
     if body is not None:
-        inputs = _inputs(scene, body, inputs)
-    skinning = used_joints(parents.tolist(), relevant, least=1e-4)
-    kept = tuple(sorted(set(skinning) | set(_closure(inputs, parents))))
+        parents, joints, rest_rotations = np.asarray(body.parents), body.joints, body.rest_rotations
+        body_weights = body.weights[prepared.part]
+    skinning = used_joints(parents.tolist(), np.concatenate([prepared.weights, body_weights]), least=1e-4)
+    kept = sorted({*skinning, *_closure(prepared.inputs.tolist(), parents)})
     place = {j: i for i, j in enumerate(kept)}
-    columns = np.asarray(kept)
     skeleton = Skeleton(
-        jnp.asarray(joints[columns], dtype), tuple(place[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
+        jnp.asarray(joints[kept], dtype), tuple(place[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
     )
+    collides = len(prepared.part) > 0 and physics.collision.stiffness > 0
     surface = body_points = body_blend = None
     if collides:
-        faces, body_points = _submesh(body.faces, part, len(body.vertices)), body.vertices[part]
-        surface = surface_from(garment.vertices, body_points, faces)
-        body_blend = blend_from(body.weights[part][:, columns], dtype=dtype)
-        body_points = jnp.asarray(body_points, dtype)
-    number = lambda value: jnp.asarray(value, dtype)  # noqa: E731
+        faces, points = _submesh(body.faces, prepared.part, len(body.vertices)), body.vertices[prepared.part]
+        surface = surface_from(garment.vertices, points, faces)
+        body_blend, body_points = blend_from(body_weights[:, kept], dtype=dtype), jnp.asarray(points, dtype)
     membrane = None if physics.membrane.model == "none" else physics.membrane.model
     numbers = tuple(getattr(physics.membrane, n) for n in MEMBRANES[membrane][1]) if membrane else ()
-    model = Model(
+    material = Material(
+        density=jnp.asarray(physics.density, dtype),
+        membrane=tuple(jnp.asarray(n, dtype) for n in numbers),
+        bending=jnp.asarray(physics.bending.stiffness, dtype),
+        collision=jnp.asarray(physics.collision.stiffness, dtype),
+        thickness=jnp.asarray(physics.collision.thickness, dtype),
+        pinning=jnp.asarray(physics.pinning.stiffness, dtype),
+        gravity=jnp.asarray(physics.gravity, dtype),
+    )
+    moves = bool(prepared.moves)
+    terms = Terms(
+        membrane=membrane if any(numbers) else None,
+        bending=physics.bending.stiffness > 0,
+        collision=physics.collision.distance if collides else None,
+        exact=physics.collision.search == "exact",
+        gravity=any(physics.gravity),
+        inertia=physics.inertia and moves,
+        pinning=len(pins) > 0 and physics.pinning.stiffness > 0,
+    )
+    return Model(
         skeleton=skeleton,
-        rest_rotations=None if rest_rotations is None else jnp.asarray(rest_rotations[columns], dtype),
+        rest_rotations=None if rest_rotations is None else jnp.asarray(rest_rotations[kept], dtype),
         garment=Garment(mesh, jnp.asarray(pins, jnp.int32)),
-        blend=blend_from(weights[:, columns], dtype=dtype),
-        material=Material(
-            density=number(physics.density),
-            membrane=tuple(number(n) for n in numbers),
-            bending=number(physics.bending.stiffness),
-            collision=number(physics.collision.stiffness),
-            thickness=number(physics.collision.thickness),
-            pinning=number(physics.pinning.stiffness),
-            gravity=number(physics.gravity),
-        ),
-        basis=_basis(scene, mesh, dtype),
+        blend=blend_from(prepared.weights[:, kept], dtype=dtype),
+        material=material,
+        basis=jnp.asarray(prepared.basis, dtype),
         body=body_points,
         body_blend=body_blend,
         surface=surface,
-        terms=Terms(
-            membrane=membrane if any(numbers) else None,
-            bending=physics.bending.stiffness > 0,
-            collision=physics.collision.distance if collides else None,
-            exact=physics.collision.search == "exact",
-            gravity=any(physics.gravity),
-            inertia=physics.inertia and moves,
-            pinning=len(pins) > 0 and physics.pinning.stiffness > 0,
-        ),
-        inputs=tuple(place[j] for j in inputs),
-        source_joints=kept,
+        terms=terms,
+        inputs=tuple(place[j] for j in prepared.inputs.tolist()),
+        source_joints=tuple(kept),
         descriptor=scene.network.descriptor,
         fps=scene.motion.fps,
         moves=moves,
     )
-    tracks = {name: track_of(model, r) for name, r in records.items()}
-    train = {name: tracks[name] for name in train_names}
-    if scene.motion.mirror and body is not None:
-        partner = mirror_partners(body.joint_names, joints)
-        for name in train_names:
-            r = records[name]
-            train[f"{name} (mirrored)"] = track_of(model, io.MotionRecord(*mirror(r.poses, r.translation, partner), r.fps, ()))
-    if motions and not train:
-        still = io.MotionRecord(np.zeros((1, len(parents), 3), np.float32), np.zeros((1, 3), np.float32), model.fps, ())
-        train["rest pose"] = track_of(model, still)
-    return Assembly(
-        scene=scene,
-        model=model,
-        network=_network(scene, model),
-        body=body,
-        garment=garment,
-        train=train,
-        validation={name: tracks[name] for name in (scene.motion.validation if motions else ())},
-    )
 
 
-def track_of(model: Model, record: io.MotionRecord) -> Track:
-    """Descriptors and transforms of a motion that is at the model's frame rate."""
+def _training_track(scene, model: Model, body, records: list[io.MotionRecord]) -> Track:
+    if not records:
+        joints = 1 if body is None else len(body.parents)
+        records = [io.MotionRecord(np.zeros((1, joints, 3), np.float32), np.zeros((1, 3), np.float32), model.fps, ())]
+    elif scene.motion.mirror and body is not None:
+        partner = mirror_partners(body.joint_names, body.joints)
+        records = records + [io.MotionRecord(*mirror(r.poses, r.translation, partner), r.fps, r.joint_names) for r in records]
+    return track_of(model, *records)
+
+
+def track_of(model: Model, *records: io.MotionRecord) -> Track:
+    """Descriptors and transforms of motions that are at the model's frame rate, end to end."""
     dtype = model.skeleton.joints.dtype
-    return track(model, local_rotations(model, jnp.asarray(record.poses, dtype)), jnp.asarray(record.translation, dtype))
+    lengths = [len(r.poses) for r in records]
+    start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+    poses = jnp.asarray(np.concatenate([r.poses for r in records]), dtype)
+    translation = jnp.asarray(np.concatenate([r.translation for r in records]), dtype)
+    return track(model, local_rotations(model, poses), translation, jnp.asarray(start, jnp.int32))
 
 
 def _network(scene: Scene, model: Model) -> NCS:
@@ -254,13 +277,6 @@ def _network(scene: Scene, model: Model) -> NCS:
         decoder=Decoder(model.garment.mesh.rest.shape[0], spec.decoder, model.basis.shape[1]),
         learn_weights=scene.garment.learn_weights,
     )
-
-
-def _basis(scene: Scene, mesh, dtype):
-    count = min(scene.network.modes, mesh.rest.shape[0] - 1)
-    if not count:
-        return jnp.zeros((mesh.rest.shape[0], 0), dtype)
-    return modal_basis(np.asarray(mesh.rest), np.asarray(mesh.faces), np.asarray(mesh.vertex_area), count, dtype=dtype)
 
 
 def _closure(joints, parents) -> list[int]:
@@ -284,13 +300,13 @@ def _pins(scene: Scene, garment: io.GarmentRecord) -> np.ndarray:
     return np.asarray(garment.groups[name], np.int32)
 
 
-def _part(scene, body, garment, parents, weights, records) -> np.ndarray:
+def _part(scene, body, garment, weights, records) -> np.ndarray:
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
-    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in parents))
-    poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(parents), 3), np.float32)
+    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
+    poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(body.parents), 3), np.float32)
     looked = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
-    local = np.asarray(axis_angle_to_matrix(jnp.asarray(looked)))
+    local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(looked)))
     if body.rest_rotations is not None:
         local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
     near = touchable(

@@ -1,6 +1,7 @@
 """Run folders: Orbax checkpoints, and the JSON that rebuilds everything else.
 
     RUN/run.json                the scene, the steps planned, the seed, the versions
+    RUN/prepared.npz            what was found out from the scene's files: skinning weights, touchable part, modes
     RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
     RUN/log.csv                 one row a report
 
@@ -9,16 +10,20 @@ Every write goes to a temporary name first and is renamed when complete, so a ki
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
+from ncs_jax.assembly import Prepared
 from ncs_jax.errors import InputError
 
-__all__ = ["Checkpoints", "read_run", "write_run"]
+__all__ = ["Checkpoints", "read_prepared", "read_run", "write_prepared", "write_run"]
 
 
 def write_run(run: Path, facts: dict) -> None:
@@ -53,6 +58,27 @@ def read_run(run: Path) -> dict:
     if not isinstance(facts, dict) or "scene" not in facts or "steps" not in facts:
         raise InputError("not a run file", file=path, field="scene", mend="train again into a new folder")
     return facts
+
+
+def write_prepared(run: Path, prepared: Prepared) -> None:
+    """Write RUN/prepared.npz atomically."""
+    temporary = run / "prepared.part.npz"
+    np.savez_compressed(temporary, **vars(prepared))
+    os.replace(temporary, run / "prepared.npz")
+
+
+def read_prepared(run: Path) -> Prepared:
+    """Read RUN/prepared.npz.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = Path(run) / "prepared.npz"
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return Prepared(**{f.name: data[f.name] for f in dataclasses.fields(Prepared)})
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot be read: {error}", file=path, mend="train again into a new folder") from None
 
 
 class Checkpoints:

@@ -216,7 +216,7 @@ def _evaluate(options) -> int:
         if not options.scene:
             raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
         animation, scene = io.read_animation(target), load_scene(options.scene)
-        assembly = assemble(scene, motions=False)
+        assembly = assemble(scene)
         names = (options.motion,) if options.motion else _default_motions(scene)
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
@@ -266,9 +266,10 @@ def _check(options) -> int:
         print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     print(f"  joints    {', '.join(joints)}")
     print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
-    for kind, tracks in (("train", assembly.train), ("validate", assembly.validation)):
-        for name, track in tracks.items():
-            print(f"  {kind:9} {name}: {track.start.shape[0]} frames at {model.fps:g} per second")
+    scene = assembly.scene
+    for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
+        for name in names:
+            print(f"  {kind:9} {name}: {len(assembly.motions[name].poses)} frames at {model.fps:g} per second")
     if not model.moves:
         print("  the character never moves: only the static network is trained")
     if model.surface is not None:

@@ -148,7 +148,7 @@ def mesh_from(
     h = x[hinges]
     hinge_area = area[sides[inner]]
     with jax.enable_x64(True):
-        angle = np.asarray(dihedral(jnp.asarray(h), jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))))
+        angle = np.asarray(jax.jit(dihedral)(jnp.asarray(h), jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))))
     array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
     return Mesh(
         rest=array(x),

@@ -14,7 +14,7 @@ from ncs_jax.descriptors import Joints
 from ncs_jax.kinematics import forward, transforms
 from ncs_jax.model import Model
 
-__all__ = ["Track", "input_joints", "join", "mirror", "track"]
+__all__ = ["Track", "input_joints", "mirror", "track"]
 
 
 @jax.tree_util.register_dataclass
@@ -37,35 +37,29 @@ def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joint
     return Joints(local[inputs], pose.rotations[inputs], pose.positions[inputs])
 
 
-def track(model: Model, local: Float[Array, "frames joints 3 3"], translation: Float[Array, "frames 3"]) -> Track:
-    """Descriptors and joint transforms of a motion sampled at the model's frame rate.
+@jax.jit
+def track(
+    model: Model,
+    local: Float[Array, "frames joints 3 3"],
+    translation: Float[Array, "frames 3"],
+    start: Int[Array, "frames"],
+) -> Track:
+    """Descriptors and joint transforms of motions laid end to end, sampled at the model's frame rate.
 
     Args:
-        local: local rotations of the model's joints since rest. translation: of the root, m.
+        local: local rotations of the model's joints since rest. translation: of the root, m. start: first frame of the motion
+            that each frame belongs to.
     """
-    frames = local.shape[0]
-
-    @jax.jit
-    def run(model, local, translation):
-        pose = forward(model.skeleton, local, translation)
-        joints = jax.vmap(lambda r, p: input_joints(model, r, p))(local, pose)
-        earlier = [jnp.maximum(jnp.arange(frames) - k, 0) for k in (1, 2)]
-        previous, before = (jax.tree.map(lambda a, k=k: a[k], joints) for k in earlier)
-        g = model.material.gravity
-        static = jax.vmap(lambda j: descriptors.static(j, g, model.descriptor))(joints)
-        dynamic = jax.vmap(lambda j, p, b: descriptors.dynamic(j, p, b, g, 1 / model.fps, model.descriptor))(
-            joints, previous, before
-        )
-        return static, dynamic, transforms(model.skeleton, pose)
-
-    return Track(*run(model, local, translation), start=jnp.zeros(frames, jnp.int32))
-
-
-def join(tracks: list[Track]) -> Track:
-    """Several motions as one track."""
-    offsets = np.cumsum([0] + [t.start.shape[0] for t in tracks[:-1]])
-    moved = [Track(t.static, t.dynamic, t.matrices, t.start + int(o)) for t, o in zip(tracks, offsets, strict=True)]
-    return jax.tree.map(lambda *a: jnp.concatenate(a), *moved)
+    pose = forward(model.skeleton, local, translation)
+    joints = jax.vmap(lambda r, p: input_joints(model, r, p))(local, pose)
+    earlier = [jnp.maximum(jnp.arange(local.shape[0]) - k, start) for k in (1, 2)]
+    previous, before = (jax.tree.map(lambda a, k=k: a[k], joints) for k in earlier)
+    g = model.material.gravity
+    static = jax.vmap(lambda j: descriptors.static(j, g, model.descriptor))(joints)
+    dynamic = jax.vmap(lambda j, p, b: descriptors.dynamic(j, p, b, g, 1 / model.fps, model.descriptor))(
+        joints, previous, before
+    )
+    return Track(static, dynamic, transforms(model.skeleton, pose), start)
 
 
 def mirror(poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.assembly import load_motion
+from ncs_jax.errors import InputError
 from ncs_jax.evaluation import summarise
 from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
 from ncs_jax.rotations import axis_angle_to_matrix
@@ -48,14 +49,16 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     folder = Path(folder)
     scene, body = run.assembly.scene, run.assembly.body
     names = (motion,) if motion else (*scene.motion.validation, *scene.motion.files)
-    name = names[0] if names else "rest pose"
+    if not names:
+        raise InputError("a motion to show is needed", field="motion.files", mend="name one in the scene")
+    name = names[0]
     track = run.track(name)
     alphas = ALPHAS if run.assembly.network.dynamic is not None else (0.0,)
     animations = {f"{alpha:g}": run.animate(track, alpha) for alpha in alphas}
     garment = animations["1"] if "1" in animations else animations["0"]
     faces = run.assembly.garment.faces
     body_vertices = body_faces = None
-    if body is not None and name in names:
+    if body is not None:
         body_vertices, body_faces = posed_body(body, load_motion(scene, name, body)), body.faces
     fps = run.assembly.model.fps
     quantities = summarise(run.evaluate(track))

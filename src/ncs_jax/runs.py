@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
-from ncs_jax.checkpoint import Checkpoints, read_run, write_run
+from ncs_jax.checkpoint import Checkpoints, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import measure, summarise
 from ncs_jax.motion import Track
@@ -52,11 +52,9 @@ class Run:
     steps: int = 0
 
     def track(self, motion: str) -> Track:
-        """A motion file, `ncs:NAME` or one of the scene's motions, ready to animate."""
-        known = {**self.assembly.train, **self.assembly.validation}
-        if motion in known:
-            return known[motion]
-        return track_of(self.assembly.model, load_motion(self.assembly.scene, motion, self.assembly.body))
+        """A motion file or `ncs:NAME`, ready to animate."""
+        a = self.assembly
+        return track_of(a.model, a.motions.get(motion) or load_motion(a.scene, motion, a.body))
 
     def animate(self, motion: str | Track, alpha: float = 1.0) -> np.ndarray:
         """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves."""
@@ -72,7 +70,7 @@ class Run:
 _animate = jax.jit(animate, static_argnums=1)
 
 
-def load_run(folder: str | Path, *, motions: bool = False) -> Run:
+def load_run(folder: str | Path) -> Run:
     """Load a run folder: the scene from its JSON, the parameters from its newest checkpoint.
 
     Raises:
@@ -81,7 +79,7 @@ def load_run(folder: str | Path, *, motions: bool = False) -> Run:
     folder = Path(folder)
     facts = read_run(folder)
     scene = scene_from(facts["scene"], source=str(folder / "run.json"))
-    assembly = assemble(scene, motions=motions, moves=facts["moves"])
+    assembly = assemble(scene, prepared=read_prepared(folder))
     if not (folder / "checkpoints").is_dir():
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     checkpoints = Checkpoints(folder)
@@ -138,7 +136,8 @@ def train(
         return jnp.asarray(ends), jnp.asarray(pairs.astype(np.int32))
 
     if out is not None and facts is None:
-        write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict(), "moves": model.moves})
+        write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict()})
+        write_prepared(out, assembly.prepared)
     if facts is not None and facts["steps"]:
         steps = facts["steps"]
     elif minutes is not None:
@@ -146,7 +145,7 @@ def train(
     else:
         steps = steps or spec.steps
     if out is not None and (facts is None or not facts["steps"]):
-        facts = {"steps": steps, "seed": seed, "scene": scene.to_dict(), "moves": model.moves, "versions": _versions()}
+        facts = {"steps": steps, "seed": seed, "scene": scene.to_dict(), "versions": _versions()}
         write_run(out, facts)
 
     state = initial_state(model, network, seed)
@@ -169,7 +168,7 @@ def train(
             dropped = int(state.dropped)
             message = diagnose(model, network, state.params, track, state.fault)
         validation = None
-        if assembly.validation and (done % check == 0 or done == steps):
+        if scene.motion.validation and (done % check == 0 or done == steps):
             validation = _validate(Run(assembly, state.params))
         now = time.monotonic()
         if pace is None:  # the first chunk compiles: it does not count for the pace
@@ -211,7 +210,7 @@ def _fitting_steps(began: float, minutes: float, run, model, network) -> int:
 
 def _validate(run: Run) -> dict[str, float]:
     """Mean over the validation motions of total energy, strain and penetration."""
-    rows = [summarise(run.evaluate(track)) for track in run.assembly.validation.values()]
+    rows = [summarise(run.evaluate(name)) for name in run.assembly.scene.motion.validation]
     return {k: float(np.mean([r[k] for r in rows])) for k in ("total", "strain_mean", "penetrating") if k in rows[0]}
 
 

@@ -164,7 +164,9 @@ def _scan_nearest(x, features, names, squared):
         return (jnp.where(closer, d, best[0]), jnp.where(closer, name, best[1])), None
 
     start = (jnp.full(x.shape[1:], jnp.inf, x.dtype), jnp.zeros(x.shape[1:], jnp.int32))
-    return lax.scan(step, start, (features, names), unroll=8)[0]
+    # A step of a few operations is worth unrolling; unrolled triangles only take long to compile.
+    unroll = 8 if squared is _squared_to_points else 1
+    return lax.scan(step, start, (features, names), unroll=unroll)[0]
 
 
 def _all(x, features, squared):
@@ -230,10 +232,6 @@ def nearest_vertex(
     candidates' best stands, and the second result tells which answers are certain.
     """
     return _search(x, body, surface.vertex_blocks, surface, _squared_to_points, exact)
-
-
-def _triangle_features(corners):
-    return corners  # (faces, 3 corners, 3 components)
 
 
 def nearest_triangle(
