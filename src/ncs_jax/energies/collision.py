@@ -259,8 +259,9 @@ def triangle_distance(
         d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
 
     The sign comes from the pseudo-normal of the feature that holds c (face, edge or vertex), which alone is right at
-    edges and vertices. On the rim of a touchable part, where the body goes on unseen, everything counts as outside. The closest point and n are constants to the derivative, which is exact to first order; on the
-    surface itself n is the pseudo-normal. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
+    edges and vertices; on the rim of a touchable part, where the body goes on unseen, everything counts as outside. The
+    closest point and n are constants to the derivative, which is exact to first order; on the surface itself n is the
+    pseudo-normal. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
     """
     corners = lax.stop_gradient(body)[surface.faces[index]]
     weights = closest_weights(lax.stop_gradient(x), corners)

