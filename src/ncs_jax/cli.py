@@ -232,19 +232,16 @@ def _evaluate(options) -> int:
     if options.json:
         print(json.dumps({n: {"mean": summarise(r), "frames": {k: v.tolist() for k, v in r.items()}} for n, r in rows.items()}))
         return 0
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"{options.target}: means over the frames (median for out_of_balance, largest for depth_max)")
-    table.add_column("quantity")
-    table.add_column("unit")
-    for name in rows:
-        table.add_column(Path(name).stem if not name.startswith("ncs:") else name, justify="right")
     means = {name: summarise(r) for name, r in rows.items()}
+    if len(means) > 1:
+        means["all"] = {k: float(np.mean([m[k] for m in means.values()])) for k in next(iter(means.values()))}
+    names = [name if name.startswith("ncs:") else Path(name).stem for name in means]
+    width = max(map(len, names)) + 2
     for quantity in next(iter(means.values())):
-        unit = QUANTITIES.get(quantity, ("J", ""))[0]
-        table.add_row(quantity, unit, *(f"{m[quantity]:.4g}" for m in means.values()))
-    Console().print(table)
+        unit, text = QUANTITIES.get(quantity, ("J", "energy"))
+        print(f"{quantity} [{unit}], {text}")
+        for name, m in zip(names, means.values(), strict=True):
+            print(f"  {name:{width}} {m[quantity]:.4g}")
     return 0
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,15 +67,12 @@ def _frame(model: Model, x, previous, before, matrices) -> dict[str, Float[Array
     return result
 
 
-@functools.partial(jax.jit)
-def _measure(model, vertices, matrices):
-    frames = jnp.arange(vertices.shape[0])
+@jax.jit
+def _measure(model, now, previous, before, matrices):
+    return lax.map(lambda frame: _frame(model, *frame), (now, previous, before, matrices))
 
-    def one(t):
-        previous, before = vertices[jnp.maximum(t - 1, 0)], vertices[jnp.maximum(t - 2, 0)]
-        return _frame(model, vertices[t], previous, before, matrices[t])
 
-    return lax.map(one, frames)
+BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
 
 
 def measure(model: Model, vertices: Float[Array, "frames verts 3"], track: Track) -> dict[str, np.ndarray]:
@@ -89,7 +84,14 @@ def measure(model: Model, vertices: Float[Array, "frames verts 3"], track: Track
     Energies use the scene's own terms; penetration uses the exact signed distance to the body's triangles. Before its first
     frame the garment is taken to have been at rest.
     """
-    return {name: np.asarray(v) for name, v in _measure(model, jnp.asarray(vertices), track.matrices).items()}
+    frames = len(vertices)
+    vertices = np.asarray(vertices)
+    blocks = []
+    for first in range(0, frames, BLOCK):
+        t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
+        three = (jnp.asarray(vertices[np.maximum(t - k, 0)]) for k in range(3))
+        blocks.append(jax.device_get(_measure(model, *three, track.matrices[t])))
+    return {name: np.concatenate([b[name] for b in blocks])[:frames] for name in blocks[0]}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:

@@ -18,7 +18,7 @@ import numpy as np
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.errors import InputError
-from ncs_jax.evaluation import measure, summarise
+from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
 from ncs_jax.rollout import animate
 from ncs_jax.scene import Scene, load_scene, scene_from
@@ -59,7 +59,10 @@ class Run:
     def animate(self, motion: str | Track, alpha: float = 1.0) -> np.ndarray:
         """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves."""
         track = self.track(motion) if isinstance(motion, str) else motion
-        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, track, alpha))
+        frames = track.start.shape[0]
+        # The last frame is repeated up to a whole number of blocks: motions of many lengths share a compilation.
+        padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % BLOCK)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
+        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, padded, alpha))[:frames]
 
     def evaluate(self, motion: str | Track, alpha: float = 1.0) -> dict[str, np.ndarray]:
         """Physical quantities per frame, see `evaluation.QUANTITIES`."""

@@ -66,16 +66,13 @@ def _blocks(points: np.ndarray, size: int) -> np.ndarray:
     return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
 
 
-def surface_from(
-    cloth: np.ndarray,
-    body: np.ndarray,
-    faces: np.ndarray,
-    *,
-    groups: int = 10,
-    cloth_size: int = 40,
-    body_size: int = 40,
-) -> Surface:
-    """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body."""
+def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, groups: int = 12) -> Surface:
+    """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body.
+
+    `groups`: how many body groups near a cloth group are searched before the answer is checked. The sizes of the groups were
+    the fastest measured with 1,000 and with 4,500 cloth vertices.
+    """
+    cloth_size, body_size = max(8, min(40, len(cloth) // 64)), 40
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
     cloth_blocks = _blocks(cloth, cloth_size)
     place = np.zeros(len(cloth), np.int32)
@@ -175,6 +172,22 @@ def _all(x, features, squared):
     return _scan_nearest(x.T, lanes[..., None], jnp.arange(len(features), dtype=jnp.int32), squared)
 
 
+def _smallest(values, count):
+    """Row numbers (count, columns) of the smallest entries of every column, and the next one's value.
+
+    By `count` passes over the table, which on a CPU is ten times faster than sorting it.
+    """
+    rows = jnp.arange(len(values), dtype=jnp.int32)[:, None]
+
+    def take(left, _):
+        least = left.min(axis=0)
+        row = jnp.where(left == least, rows, len(values) - 1).min(axis=0)
+        return jnp.where(rows == row, jnp.inf, left), (row, least)
+
+    left, (chosen, _) = lax.scan(take, values, None, length=count)
+    return chosen, left.min(axis=0)
+
+
 def _candidates(x, features, blocks, surface, squared):
     """Nearest feature among the groups nearest to each cloth group, and whether no other group can hold a nearer one.
 
@@ -186,11 +199,8 @@ def _candidates(x, features, blocks, surface, squared):
     cloth = x[surface.cloth_blocks]
     low, high = corners.min(axis=1), corners.max(axis=1)
     gap = jnp.maximum(jnp.maximum(low - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high), 0)
-    gap = jnp.sum(gap * gap, axis=-1)
-    count = min(surface.groups, len(blocks))
-    nearest, chosen = lax.top_k(-gap, min(count + 1, len(blocks)))
-    bound = -nearest[:, count] if len(blocks) > count else jnp.full(len(cloth), jnp.inf, x.dtype)
-    chosen = chosen[:, :count]
+    chosen, bound = _smallest(jnp.sum(gap * gap, axis=-1).T, min(surface.groups, len(blocks)))
+    chosen = chosen.T
     listed = grouped[chosen].reshape(len(cloth), -1, *features.shape[1:])
     names = blocks[chosen].reshape(len(cloth), -1)
     # (list, [3 corners,] 3, cloth groups, 1) against x (3, cloth groups, lanes)
