@@ -1,0 +1,19 @@
+"""Files in and out: readers return checked NumPy records, and whatever is wrong with a file becomes one InputError."""
+
+from ncs_jax.io.animation import read_animation, write_animation
+from ncs_jax.io.body import read_body
+from ncs_jax.io.garment import read_garment
+from ncs_jax.io.motion import read_motion
+from ncs_jax.io.records import AnimationRecord, BodyRecord, GarmentRecord, MotionRecord
+
+__all__ = [
+    "AnimationRecord",
+    "BodyRecord",
+    "GarmentRecord",
+    "MotionRecord",
+    "read_animation",
+    "read_body",
+    "read_garment",
+    "read_motion",
+    "write_animation",
+]

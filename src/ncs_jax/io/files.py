@@ -1,0 +1,105 @@
+"""Opening what is there and replacing what is finished: every failure of the file system becomes an InputError."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ncs_jax.errors import InputError
+
+__all__ = ["LARGEST", "readable", "reading", "replacing", "text_of", "unpackable"]
+
+LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
+PACKING = 1100  # deflate packs at most 1032 to 1, so a header that promises more of its file is wrong
+
+
+def readable(path: str | Path) -> Path:
+    """The path of a regular file that is there, is not empty and may be read."""
+    file = Path(path).expanduser()
+    if file.is_dir():
+        raise InputError("a file expected", file=file, value="a folder", mend="name a file in it")
+    if not file.is_file():
+        raise InputError("no such file", file=file, mend="check the path")
+    try:
+        with file.open("rb"):
+            size = file.stat().st_size
+    except OSError as error:
+        raise InputError(f"cannot be opened: {error}", file=file, mend="check the path and its permissions") from None
+    if size == 0:
+        raise InputError("an empty file", file=file, value="0 bytes", mend="write it again")
+    return file
+
+
+@contextmanager
+def reading(file: Path, kind: str) -> Iterator[None]:
+    """Whatever a parser that is not ours raises on a broken file comes out as one InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # zipfile, zlib, h5py and trimesh each have their own dozen
+        raise InputError(
+            f"not a readable {kind} file: {type(error).__name__} {' '.join(str(error).split())[:200]}".rstrip(),
+            file=file,
+            mend="the file is damaged or of another format; write it again",
+        ) from None
+
+
+def text_of(path: str | Path) -> tuple[Path, str]:
+    """A text file whole; bytes that are not UTF-8 are replaced, as they can only stand in names and comments."""
+    file = readable(path)
+    size = file.stat().st_size
+    if size > LARGEST // 4:
+        raise InputError(f"at most {LARGEST // 4} bytes expected", file=file, value=f"{size} bytes", mend="split it")
+    with reading(file, "text"):
+        return file, file.read_bytes().decode("utf-8-sig", errors="replace")
+
+
+def unpackable(file: Path, field: str, size: int) -> None:
+    """Refuse an array that needs more memory than is allowed, or more than its file can hold however well packed."""
+    if size > LARGEST:
+        raise InputError(
+            f"at most {LARGEST} bytes expected", file=file, field=field, value=f"{size} bytes", mend="split the file"
+        )
+    if size > PACKING * file.stat().st_size:
+        raise InputError(
+            f"more than a file of {file.stat().st_size} bytes can hold", file=file, field=field, value=f"{size} bytes",
+            mend="the header is damaged; write it again",
+        )  # fmt: skip
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary sibling to write; it takes the place of `path` at once when all is written, and is removed when it is not.
+
+    Missing parent folders are made. A folder takes the place of a folder; its owner checks first what would be lost.
+    """
+    file = Path(path).expanduser()
+    if "\0" in str(file) or not file.name:
+        raise InputError("a file name expected", file=file, value=str(path), mend="name a file")
+    part = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        if file.is_dir() and part.is_dir():
+            old = part.with_suffix(".old")
+            os.replace(file, old)
+            os.replace(part, file)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            os.replace(part, file)
+    except OSError as error:
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", file=file,
+            mend="choose a place that you may write to and that has room",
+        ) from None  # fmt: skip
+    finally:
+        if part.is_dir():
+            shutil.rmtree(part, ignore_errors=True)
+        else:
+            with suppress(OSError):  # where its folder is a file, there is nothing to remove
+                part.unlink(missing_ok=True)

@@ -1,0 +1,98 @@
+"""Motions from .npz and .h5 (this package's, and AMASS's), and from .bvh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.bvh import read_bvh
+from ncs_jax.io.hdf5 import read_hdf5
+from ncs_jax.io.npz import read_npz
+from ncs_jax.io.quaternions import to_axis_angle
+from ncs_jax.io.records import MotionRecord
+from ncs_jax.io.table import Table, floats, select
+
+__all__ = ["read_motion"]
+
+FPS = ("fps", "mocap_framerate", "mocap_frame_rate")
+FIELDS = ("poses", "quaternions", "trans", "joint_names", *FPS)
+FORMATS = (".npz", ".h5", ".hdf5", ".bvh")
+
+
+def read_motion(
+    path: str | Path, *, frame_range: tuple[int, int | None] | None = None, scale: float | int = 1.0
+) -> MotionRecord:
+    """A motion as local rotations since rest, axis times angle, and the root's translation since rest.
+
+    .npz and .h5 hold `poses` (T, J, 3) or (T, 3 J), or `quaternions` (T, J, 4) with w first and of any length but zero; `trans`
+    (T, 3); and `fps`, in AMASS `mocap_framerate`. `joint_names` (J,) may be there. A .bvh names its joints; its translation is
+    the root's position less the root's OFFSET.
+
+    Args:
+        path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end. Other frames may be
+            broken. scale: metres per unit of the file's translation, for .bvh often 0.01 or 0.0254; the file cannot tell.
+
+    Raises:
+        InputError: the file cannot be read; or shapes disagree, a chosen frame has a number that is not finite or a quaternion
+            of length zero, there is no frame, or the frame rate is not above 0.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
+    if not 0 < scale < 1e6:
+        raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
+    if suffix == ".bvh":
+        bvh = read_bvh(path)
+        file, poses, translation, fps, names = bvh.file, bvh.poses, bvh.positions - bvh.offsets[0], bvh.fps, bvh.joint_names
+    else:
+        table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
+        file, poses, translation, fps = table.file, _rotations(table), table.array("trans"), table.number(*FPS)
+        names = table.joint_names(poses.shape[1])
+        if translation.shape != (len(poses), 3):
+            raise InputError(
+                f"an array of shape ({len(poses)}, 3) expected, one row a frame", file=file, field="trans",
+                value=translation.shape, mend="write as many rows as there are poses",
+            )  # fmt: skip
+    chosen = select(file, len(poses), frame_range)
+    labels = [f" ({n})" for n in names] or [""] * poses.shape[1]
+    field, shape = ("poses", "quaternions")[poses.shape[2] - 3], ("T", *poses.shape[1:])
+    poses = floats(file, field, poses[chosen], shape, ("frame", "joint"), chosen.start, labels)
+    if poses.shape[2] == 4:
+        poses = _from_quaternions(file, poses, labels, chosen.start)
+    moved = floats(file, "trans", translation[chosen], ("T", 3), ("frame",), chosen.start)
+    return MotionRecord(poses, moved * moved.dtype.type(scale), fps, names)
+
+
+def _rotations(table: Table) -> np.ndarray:
+    """Poses (T, J, 3) or quaternions (T, J, 4), unchecked but for their shape."""
+    name = table.first("poses", "quaternions")
+    if name == "poses" and "quaternions" in table:
+        raise InputError("either poses or quaternions expected", file=table.file, field="poses", mend="leave one out")
+    array = table.array(name)
+    flat = name == "poses" and array.ndim == 2 and array.shape[1] % 3 == 0
+    size = 3 if name == "poses" else 4
+    if flat:
+        array = array.reshape(len(array), -1 if array.size else array.shape[1] // 3, 3)
+    if array.ndim != 3 or array.shape[2] != size or array.shape[1] == 0:
+        expected = "(T, J, 3) or (T, 3 J)" if name == "poses" else "(T, J, 4)"
+        raise InputError(
+            f"an array of shape {expected} expected", file=table.file, field=name, value=array.shape,
+            mend="write one rotation for each frame and joint",
+        )  # fmt: skip
+    if len(array) == 0:
+        raise InputError("at least one frame expected", file=table.file, field=name, value=array.shape, mend="write it again")
+    return array
+
+
+def _from_quaternions(file: Path, q: np.ndarray, labels: list[str], start: int) -> np.ndarray:
+    length = np.linalg.norm(q.astype(np.float64), axis=-1)
+    bad = np.argwhere(length < 1e-6)
+    if len(bad):
+        t, j = (int(i) for i in bad[0])
+        raise InputError(
+            "a quaternion that is not zero expected", file=file, field=f"quaternions, frame {t + start}, joint {j}{labels[j]}",
+            value=q[t, j].tolist(), mend="write (1, 0, 0, 0) where nothing turns",
+        )  # fmt: skip
+    return to_axis_angle(q / length[..., None].astype(q.dtype))

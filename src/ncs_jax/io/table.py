@@ -1,0 +1,153 @@
+"""Named arrays of one file, taken out under checks of type, shape and finiteness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+
+__all__ = ["Table", "floats", "indices", "select"]
+
+Shape = tuple[int | str, ...]
+
+
+def _show(shape: tuple) -> str:
+    return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+
+
+def _check_shape(file: Path, field: str, array: np.ndarray, shape: Shape) -> None:
+    fits = array.ndim == len(shape) and all(isinstance(w, str) or w == n for w, n in zip(shape, array.shape, strict=True))
+    if not fits:
+        raise InputError(
+            f"an array of shape {_show(shape)} expected", file=file, field=field, value=array.shape,
+            mend="write it with that shape; a count that another array sets must agree",
+        )  # fmt: skip
+
+
+def floats(
+    file: Path,
+    field: str,
+    array: np.ndarray,
+    shape: Shape,
+    axes: tuple[str, ...] = (),
+    first: int = 0,
+    labels: list[str] | None = None,
+) -> np.ndarray:
+    """A fresh float32 or float64 array of a shape (a letter is any size), all finite.
+
+    Args:
+        file, field: what an error names. array: any numbers. axes: what the leading axes count, for the error ("frame",
+            "joint"). first: number of the first entry along the first axis. labels: of the entries along the second.
+    """
+    if array.dtype.kind not in "fiu":
+        raise InputError("an array of numbers expected", file=file, field=field, value=str(array.dtype), mend="write floats")
+    _check_shape(file, field, array, shape)
+    single = array.dtype.kind == "f" and array.dtype.itemsize == 4
+    with np.errstate(all="ignore"):
+        values = np.array(array, dtype=np.float32 if single else np.float64, order="C")
+        bad = ~(np.abs(values) < 1e30)  # also what single precision would turn into infinity
+    if bad.any():
+        where = [int(i) for i in np.argwhere(bad)[0]]
+        number = float(values[tuple(where)])
+        names = [f"{a} {i}" for a, i in zip(axes, [where[0] + first, *where[1:]], strict=False)] if where else []
+        if labels:
+            names[1] += labels[where[1]]
+        raise InputError(
+            "finite numbers expected", file=file, field=", ".join([field, *names]), value=number,
+            mend="mend it where the file was made, or " + ("choose other frames" if "frame" in axes else "leave it out"),
+        )  # fmt: skip
+    return values
+
+
+def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int, what: str) -> np.ndarray:
+    """An int32 array of numbers from 0 to count - 1."""
+    if array.dtype.kind not in "iu":
+        raise InputError("whole numbers expected", file=file, field=field, value=str(array.dtype), mend="write int32")
+    _check_shape(file, field, array, shape)
+    bad = (array < 0) | (array >= count)
+    if bad.any():
+        where = [int(i) for i in np.argwhere(bad)[0]]
+        raise InputError(
+            f"numbers from 0 to {count - 1} expected, of the {count} {what}", file=file, field=f"{field}, entry {where}",
+            value=int(array[tuple(where)]), mend="counting starts at 0; write only those that exist",
+        )  # fmt: skip
+    return array.astype(np.int32)
+
+
+def select(file: Path, frames: int, frame_range: tuple[int, int | None] | None) -> slice:
+    """Frames start to stop - 1 of a file; a stop of None is the end."""
+    if frame_range is None:
+        return slice(0, frames)
+    start, stop = frame_range[0], frames if frame_range[1] is None else frame_range[1]
+    if not 0 <= start < stop <= frames:
+        raise InputError(
+            f"0 <= start < stop <= {frames} expected, the number of frames", file=file, field="frame_range",
+            value=(start, stop), mend="choose frames that the file has",
+        )  # fmt: skip
+    return slice(start, stop)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Arrays by name. `names` is all that the file holds, also what was not read."""
+
+    file: Path
+    arrays: dict[str, np.ndarray]
+    names: tuple[str, ...]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.arrays
+
+    def first(self, *aliases: str) -> str:
+        """The first of some names for one thing that the file has."""
+        for name in aliases:
+            if name in self.arrays:
+                return name
+        held = ", ".join(self.names[:12]) or "nothing"
+        others = f" (or {', '.join(aliases[1:])})" if len(aliases) > 1 else ""
+        raise InputError(f"missing{others}", file=self.file, field=aliases[0], mend=f"add it; the file holds {held}")
+
+    def array(self, name: str) -> np.ndarray:
+        """An array as it was read."""
+        return self.arrays[self.first(name)]
+
+    def floats(self, name: str, shape: Shape, axes: tuple[str, ...] = ()) -> np.ndarray:
+        """See `floats`."""
+        return floats(self.file, name, self.array(name), shape, axes)
+
+    def indices(self, name: str, shape: Shape, count: int, what: str) -> np.ndarray:
+        """See `indices`."""
+        return indices(self.file, name, self.array(name), shape, count, what)
+
+    def number(self, *aliases: str) -> float:
+        """One positive number, as a scalar or an array of one."""
+        name = self.first(*aliases)
+        array = self.arrays[name]
+        if array.dtype.kind not in "fiu" or array.size != 1 or not 0 < float(array.reshape(())) < np.inf:
+            value = (
+                array.reshape(-1)[0].item() if array.size == 1 and array.dtype.kind in "fiu" else f"{array.dtype} {array.shape}"
+            )
+            raise InputError("one number above 0 expected", file=self.file, field=name, value=value, mend="write a scalar")
+        return float(array.reshape(()))
+
+    def joint_names(self, joints: int) -> tuple[str, ...]:
+        """The optional names of the joints: as many as there are, all different."""
+        if "joint_names" not in self:
+            return ()
+        array = self.arrays["joint_names"]
+        if array.dtype.kind not in "US":
+            raise InputError("text expected", file=self.file, field="joint_names", value=str(array.dtype), mend="write names")
+        _check_shape(self.file, "joint_names", array, (joints,))
+        try:
+            names = tuple(n.decode() if isinstance(n, bytes) else n for n in array.tolist())
+        except ValueError as error:  # also UnicodeDecodeError
+            raise InputError(f"text expected: {error}", file=self.file, field="joint_names", mend="write UTF-8") from None
+        twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
+        if twice is not None:
+            raise InputError(
+                "a name for each joint expected", file=self.file, field="joint_names", value=twice, mend="rename one"
+            )
+        return names
