@@ -484,6 +484,15 @@ def test_broken_fields_in_hdf5(tmp_path, case):
         read(save(tmp_path / "file.h5", fields))
 
 
+def test_hdf5_with_a_foreign_name(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file[b"\xff"] = 1
+    with pytest.raises(InputError, match="poses: missing"):
+        io.read_motion(tmp_path / "m.h5")
+
+
 def npy(header: str, data: bytes = b"", *, version: int = 1, size: int | None = None) -> bytes:
     text = header.encode()
     width = "<H" if version == 1 else "<I"

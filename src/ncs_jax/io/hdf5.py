@@ -20,7 +20,7 @@ def read_hdf5(path: str | Path, wanted: Callable[[str], bool]) -> Table:
 
     file = readable(path)
     with reading(file, "HDF5"), h5py.File(file, "r") as archive:
-        names = tuple(archive)
+        names = tuple(n for n in archive if isinstance(n, str))  # h5py gives names that are not UTF-8 as bytes
         return Table(file, {n: _array(file, n, archive) for n in names if wanted(n)}, names)
 
 

@@ -38,7 +38,7 @@ def _array(file: Path, name: str, archive: zipfile.ZipFile, member: zipfile.ZipI
             raise InputError(f"a header of at most {HEADER} bytes expected", file=file, field=name, value=f"{size} bytes")
         head = io.BytesIO(size.to_bytes(width, "little") + stream.read(size))
         shape, fortran, dtype = (npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0)(head)
-        if dtype.hasobject or dtype.kind not in "biufUS":
+        if dtype.kind not in "biufUS":
             raise InputError(
                 "plain numbers or text expected", file=file, field=name, value=f"dtype {dtype}",
                 mend="objects (pickle) are never loaded; write an array of numbers",
