@@ -6,6 +6,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ncs_jax.numerics import norm, signed_angle
@@ -108,12 +109,14 @@ def resample(
     """A motion at another frame rate: rotations by slerp, translations linearly; whole ratios keep their frames exactly."""
     frames = poses.shape[0]
     count = int((frames - 1) * fps / source_fps + 1e-6) + 1
-    times = jnp.arange(count) * (source_fps / fps)
-    low = jnp.minimum(jnp.floor(times + 1e-6).astype(jnp.int32), max(frames - 2, 0))
-    high = jnp.minimum(low + 1, frames - 1)
-    t = jnp.clip(times - low, 0, 1).astype(poses.dtype)
+    # Times, in source frames, are known on the host: in float32 they would lose whole ratios after some hundred frames.
+    times = np.arange(count) * source_fps / fps
+    times = np.where(np.abs(times - np.round(times)) < 1e-6, np.round(times), times)
+    low = np.minimum(np.floor(times).astype(np.int32), frames - 1)
+    high = np.minimum(low + 1, frames - 1)
+    t = jnp.asarray(times - low, poses.dtype)[:, None]
     q = axis_angle_to_quaternion(poses)
-    mixed = quaternion_to_axis_angle(slerp(q[low], q[high], t[:, None]))
-    exact = (jnp.abs(t) < 1e-5)[:, None]
-    moved = translation[low] + t[:, None] * (translation[high] - translation[low])
-    return jnp.where(exact[..., None], poses[low], mixed), moved
+    mixed = quaternion_to_axis_angle(slerp(q[low], q[high], jnp.broadcast_to(t, (count, poses.shape[1]))))
+    moved = translation[low] + t * (translation[high] - translation[low])
+    whole = jnp.asarray(times == low)[:, None, None]
+    return jnp.where(whole, poses[low], mixed), moved
