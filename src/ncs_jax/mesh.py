@@ -143,7 +143,7 @@ def mesh_from(
     vertex_area = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(x))
     length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
     edge_area = area[sides[:, 0]] + np.where(sides[:, 1] >= 0, area[sides[:, 1]], 0)
-    weight = 2 / np.sqrt(3) * edge_area / np.maximum(length, 1e-300) ** 2 * (length > 0)
+    weight = 2 / np.sqrt(3) * edge_area / np.where(length > 0, length, 1) ** 2 * (length > 0)
     inner = sides[:, 1] >= 0
     h = x[hinges]
     hinge_area = area[sides[inner]]
