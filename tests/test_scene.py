@@ -1,0 +1,71 @@
+"""Scene files: defaults, and one clear error for everything that can be wrong with one."""
+
+import pytest
+
+from ncs_jax.errors import InputError
+from ncs_jax.scene import Scene, load_scene, scene_from
+
+
+def write(folder, text):
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def test_everything_has_a_default(tmp_path):
+    assert load_scene(write(tmp_path, "")).to_dict() == Scene().to_dict()
+
+
+def test_a_scene_survives_its_own_tables(tmp_path):
+    scene = load_scene(write(tmp_path, "[physics]\ngravity = [0, 0, -9.81]\n[network]\ndecoder = [64, 64]\n"))
+    assert scene_from(scene.to_dict()).to_dict() == scene.to_dict()
+    assert scene.physics.gravity == (0, 0, -9.81) and scene.network.decoder == (64, 64)
+
+
+def test_relative_paths_resolve_from_the_file(tmp_path):
+    scene = load_scene(write(tmp_path, '[garment]\nfile = "shirt.obj"'))
+    assert scene.path(scene.garment.file) == tmp_path / "shirt.obj"
+    assert scene.to_dict()["garment"]["file"] == str(tmp_path / "shirt.obj")
+
+
+@pytest.mark.parametrize("name", ["demo", "tshirt", "skirt"])
+def test_packaged_scenes_are_good(name):
+    assert load_scene(f"ncs:{name}").path("ncs:body").is_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[physics]\ndensty = 0.1", ["physics.densty", "unknown key", "density"]),
+        ("[phisics]\n", ["phisics", "unknown key", "physics"]),
+        ('[physics]\ndensity = "heavy"', ["physics.density", "a number expected", "'heavy'"]),
+        ("[physics]\ndensity = -1", ["physics.density", "from 0.0001", "-1"]),
+        ("[physics]\ndensity = nan", ["physics.density", "nan"]),
+        ("[physics]\ngravity = [0, 9.81]", ["physics.gravity", "three numbers"]),
+        ("[physics]\ngravity = 9.81", ["physics.gravity", "a list expected"]),
+        ("[physics]\ninertia = 1", ["physics.inertia", "true or false"]),
+        ('[physics.membrane]\nmodel = "rubber"', ["physics.membrane.model", "stvk", "'rubber'"]),
+        ("[training]\nsteps = 1.5", ["training.steps", "whole number", "1.5"]),
+        ("[training]\nlearning_rate = 0", ["training.learning_rate", "above 0"]),
+        ("[network]\ndecoder = []", ["network.decoder", "at least one"]),
+        ("[network]\ndecoder = [512, 0]", ["network.decoder[1]", "from 1"]),
+        ("physics = 3", ["physics", "a table expected"]),
+        ('[garment]\nfile = ""', ["garment.file", "a garment is needed"]),
+        ("[physics", ["not TOML"]),
+    ],
+)
+def test_one_error_names_file_field_value_and_mend(tmp_path, text, words):
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in [str(path), *words]:
+        assert word in message
+
+
+def test_missing_files(tmp_path):
+    with pytest.raises(InputError, match="no such scene file"):
+        load_scene(tmp_path / "none.toml")
+    with pytest.raises(InputError, match="ncs:demo"):
+        load_scene("ncs:nothing")
