@@ -12,17 +12,22 @@ def grid(rows=6, columns=5, spacing=0.05, origin=(0.0, 0.3, 0.09)):
     return vertices, np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
 
 
-def post(height=1.0, radius=0.08, rings=11, around=10):
-    """A closed post of two joints, the second halfway up: a body record's arrays."""
-    import trimesh
-
-    mesh = trimesh.creation.capsule(height=height - 2 * radius, radius=radius, count=[around, around])
-    vertices = np.asarray(mesh.vertices)[:, [0, 2, 1]] * [1, 1, -1]
-    vertices = vertices - [0, vertices[:, 1].min(), 0]
+def post(height=1.0, radius=0.08, rings=16, around=12):
+    """A closed post of two joints, the second halfway up: a body file's arrays."""
+    angle = 2 * np.pi * np.arange(around) / around
+    ring = np.stack([radius * np.cos(angle), np.zeros(around), radius * np.sin(angle)], axis=1)
+    levels = np.linspace(0, height, rings)
+    vertices = np.concatenate([*(ring + [0, y, 0] for y in levels), [[0, 0, 0], [0, height, 0]]])
+    i, j = np.meshgrid(np.arange(rings - 1) * around, np.arange(around), indexing="ij")
+    a, b = (i + j).ravel(), (i + (j + 1) % around).ravel()
+    side = np.concatenate([np.stack([a, a + around, b], 1), np.stack([b, a + around, b + around], 1)])
+    this, after, top = np.arange(around), (np.arange(around) + 1) % around, (rings - 1) * around
+    lids = [np.stack([this, after, np.full(around, len(vertices) - 2)], 1)]
+    lids += [np.stack([after + top, this + top, np.full(around, len(vertices) - 1)], 1)]
     upper = np.clip((vertices[:, 1] - 0.4 * height) / (0.2 * height), 0, 1)
     return {
         "vertices": vertices,
-        "faces": np.asarray(mesh.faces, np.int32),
+        "faces": np.concatenate([side, *lids]).astype(np.int32),
         "joints": np.array([[0, 0.1, 0], [0, height / 2, 0]]),
         "parents": np.array([-1, 0]),
         "blend_weights": np.stack([1 - upper, upper], axis=1),

@@ -118,7 +118,7 @@ def _check_fit(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> 
         )  # fmt: skip
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
     gap = np.maximum(garment.vertices.min(axis=0) - high, low - garment.vertices.max(axis=0))
-    if gap.max() > 0:
+    if gap.max() > 0.1 * tall:
         raise InputError(
             "a garment that is on the body expected", file=file, field="vertices", value=f"{gap.max():.2f} m apart",
             mend="move it into the body's coordinates, or turn its axes to Y up",
@@ -264,17 +264,17 @@ def track_of(model: Model, *records: io.MotionRecord) -> Track:
     dtype = model.skeleton.joints.dtype
     lengths = [len(r.poses) for r in records]
     start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-    poses = jnp.asarray(np.concatenate([r.poses for r in records]), dtype)
-    translation = jnp.asarray(np.concatenate([r.translation for r in records]), dtype)
+    poses = jnp.asarray(np.concatenate([r.poses for r in records]).astype(dtype))
+    translation = jnp.asarray(np.concatenate([r.translation for r in records]).astype(dtype))
     return track(model, local_rotations(model, poses), translation, jnp.asarray(start, jnp.int32))
 
 
 def _network(scene: Scene, model: Model) -> NCS:
-    spec = scene.network
+    spec, (verts, modes), dtype = scene.network, model.basis.shape, model.basis.dtype
     return NCS(
-        static=StaticEncoder(spec.static),
-        dynamic=DynamicEncoder(spec.joint, spec.dynamic, spec.static[-1]) if model.moves else None,
-        decoder=Decoder(model.garment.mesh.rest.shape[0], spec.decoder, model.basis.shape[1]),
+        static=StaticEncoder(spec.static, dtype),
+        dynamic=DynamicEncoder(spec.joint, spec.dynamic, spec.static[-1], dtype) if model.moves else None,
+        decoder=Decoder(verts, spec.decoder, modes, dtype=dtype),
         learn_weights=scene.garment.learn_weights,
     )
 
@@ -309,6 +309,9 @@ def _part(scene, body, garment, weights, records) -> np.ndarray:
     local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(looked)))
     if body.rest_rotations is not None:
         local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
+    # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
+    corners = body.vertices[body.faces]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
     near = touchable(
         skeleton,
         garment.vertices,
@@ -316,7 +319,7 @@ def _part(scene, body, garment, weights, records) -> np.ndarray:
         body.vertices,
         blend_from(body.weights),
         list(local),
-        scene.physics.collision.reach,
+        scene.physics.collision.reach + edge / np.sqrt(3),
     )
     return np.unique(body.faces[near[body.faces].any(axis=1)])
 

@@ -52,7 +52,7 @@ def track(
     """
     pose = forward(model.skeleton, local, translation)
     joints = jax.vmap(lambda r, p: input_joints(model, r, p))(local, pose)
-    earlier = [jnp.maximum(jnp.arange(local.shape[0]) - k, start) for k in (1, 2)]
+    earlier = [jnp.maximum(jnp.arange(local.shape[0], dtype=start.dtype) - k, start) for k in (1, 2)]
     previous, before = (jax.tree.map(lambda a, k=k: a[k], joints) for k in earlier)
     g = model.material.gravity
     static = jax.vmap(lambda j: descriptors.static(j, g, model.descriptor))(joints)

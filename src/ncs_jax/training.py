@@ -152,7 +152,7 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         earlier = decode(network, params, model, z[:-1])
         offsets += [earlier[1], earlier[0]]
     offsets = jnp.stack(offsets, axis=1)
-    back = jnp.maximum(ends - jnp.arange(history)[:, None], track.start[ends])
+    back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, 0)
     share = (jnp.arange(ends.shape[0]) >= augmented).astype(offsets.dtype)
     weights = garment_blend(network, params, model)
@@ -168,7 +168,7 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
     """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
     grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs)
     sample_good = jnp.all(jnp.isfinite(g), axis=(1, 2)) & jnp.isfinite(sum(parts.values()))
-    good = jnp.all(sample_good) & jnp.isfinite(optax.global_norm(grads))
+    good = jnp.all(sample_good) & jnp.isfinite(optax.tree.norm(grads))
 
     def accept(state):
         updates, opt = ADAM.update(grads, state.optimiser)

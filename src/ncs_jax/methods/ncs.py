@@ -31,13 +31,14 @@ def initial_parameters(network: NCS, key: Array, model: Model) -> dict:
     """Fresh parameters: a plain pytree of arrays."""
     a, b, c = jax.random.split(key, 3)
     joints, numbers = len(model.inputs), DESCRIPTORS[model.descriptor]
-    code = jnp.zeros(network.static.sizes[-1])
+    dtype = model.basis.dtype
+    code = jnp.zeros(network.static.sizes[-1], dtype)
     params = {
-        "static": network.static.init(a, jnp.zeros((joints, numbers + 3)))["params"],
+        "static": network.static.init(a, jnp.zeros((joints, numbers + 3), dtype))["params"],
         "decoder": network.decoder.init(c, code, model.basis)["params"],
     }
     if network.dynamic is not None:
-        params["dynamic"] = network.dynamic.init(b, jnp.zeros((1, joints, numbers + 6)), code)["params"]
+        params["dynamic"] = network.dynamic.init(b, jnp.zeros((1, joints, numbers + 6), dtype), code)["params"]
     if network.learn_weights:
         params["blend"] = jnp.zeros_like(model.blend.weights)
     return params
@@ -75,12 +76,12 @@ def window_codes(
     Frames before a motion's start are rest: zero dynamic descriptors.
     """
     start = track.start[ends]
-    back = ends - jnp.arange(length - 1, -1, -1)[:, None]
-    inside = jnp.maximum(back, start)
+    back = ends[None] - jnp.arange(length - 1, -1, -1, dtype=ends.dtype)[:, None]
+    inside = jnp.maximum(back, start[None])
     z_static = static_codes(network, params, track.static[inside[length - last :]])
     if network.dynamic is None:
         return z_static, None
-    moving = track.dynamic[inside] * (back >= start)[..., None, None]
+    moving = jnp.where((back >= start[None])[..., None, None], track.dynamic[inside], 0)
     rest = jnp.zeros((ends.shape[0], network.dynamic.state), moving.dtype)
     z_dynamic = network.dynamic.apply({"params": params["dynamic"]}, moving, rest)
     return z_static, z_dynamic[length - last :]

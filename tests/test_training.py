@@ -1,0 +1,190 @@
+"""The training step: what it differentiates, what it leaves out, and what it does with numbers that are not finite."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.assembly import assemble
+from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.training import (
+    CHUNK,
+    batches,
+    chunk_runner,
+    chunks,
+    diagnose,
+    glance,
+    gradients,
+    initial_state,
+    step_size,
+)
+
+from .scenes import write_scene
+
+
+def prepared(folder, changes=(), dtype=jnp.float32):
+    tables = load_scene(write_scene(folder)).to_dict()
+    for path, value in dict(changes).items():
+        *parents, last = path.split(".")
+        table = tables
+        for name in parents:
+            table = table[name]
+        table[last] = value
+    assembly = assemble(scene_from(tables), dtype=dtype)
+    spec = assembly.scene.training
+    ends = jnp.asarray(batches(assembly.track.start.shape[0], spec.batch, 0, 0, CHUNK))
+    return assembly, spec, ends, jnp.zeros_like(ends)
+
+
+def one_gradient(assembly, spec, params, ends, pairs):
+    return gradients(assembly.model, assembly.network, spec, params, assembly.track, ends, pairs)
+
+
+def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
+    """Against automatic differentiation of the whole chain with x_{t-1} and x_{t-2} held fixed."""
+    from ncs_jax.kinematics import blend, skin
+    from ncs_jax.methods.ncs import decode, window_codes
+    from ncs_jax.model import pose_body
+    from ncs_jax.objective import Frame, total
+
+    assembly, spec, ends, pairs = prepared(tmp_path, dtype=jnp.float64)
+    model, network, track = assembly.model, assembly.network, assembly.track
+    params = initial_state(model, network, 3).params
+    params = jax.tree.map(lambda p: p + 0.02 * jnp.cos(jnp.arange(p.size, dtype=p.dtype)).reshape(p.shape), params)
+    ends = ends[0]
+
+    def loss(params):
+        a, b = window_codes(network, params, track, ends, spec.window, 3)
+        offsets = decode(network, params, model, a + b)
+        result = 0.0
+        for i, t in enumerate(np.asarray(ends)):
+            at = [max(t - 2, 0), max(t - 1, 0), t]
+            x = [skin(blend(track.matrices[f], model.blend), model.garment.mesh.rest + offsets[k, i]) for k, f in enumerate(at)]
+            frame = Frame(1 / model.fps, jax.lax.stop_gradient(x[1]), jax.lax.stop_gradient(x[0]))
+            frame = dataclasses.replace(frame, body=pose_body(model, track.matrices[t]))
+            result += total(x[2], model.garment, model.material, frame, model.terms, model.surface)
+        return result / len(ends)
+
+    value, expected = jax.value_and_grad(loss)(params)
+    found, parts, _ = one_gradient(assembly, spec, params, ends, pairs[0])
+    np.testing.assert_allclose(sum(np.mean(p) for p in parts.values()), value, rtol=1e-12)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-12 * float(jnp.abs(b).max() + 1))
+    assert all(float(jnp.abs(b).max()) > 0 for b in jax.tree.leaves(expected))
+
+
+TERMS = ("membrane", "bending", "collision", "gravity", "inertia", "pinning")
+
+
+def lowered(assembly, spec, ends, pairs):
+    state = initial_state(assembly.model, assembly.network, 0)
+    runner = chunk_runner(assembly.network, spec)
+    # Plain leaves: JAX fills the containers of a lowered program's arguments with what is not an array.
+    leaves, tree = jax.tree.flatten((state, ends, pairs, 10, assembly.model, assembly.track))
+    return jax.jit(lambda *leaves: runner(*jax.tree.unflatten(tree, leaves))).lower(*leaves).as_text(debug_info=True)
+
+
+def scopes(text):
+    return {t for t in TERMS if f"/{t}/" in text or f"({t})/" in text}
+
+
+@pytest.mark.parametrize(
+    ("changes", "absent"),
+    [
+        ({"garment.pins": "pins"}, set()),
+        ({}, {"pinning"}),
+        ({"physics.bending.stiffness": 0}, {"bending", "pinning"}),
+        ({"physics.membrane.model": "none"}, {"membrane", "pinning"}),
+        ({"physics.membrane.lam": 0, "physics.membrane.mu": 0}, {"membrane", "pinning"}),
+        ({"physics.gravity": [0, 0, 0]}, {"gravity", "pinning"}),
+        ({"physics.collision.stiffness": 0}, {"collision", "pinning"}),
+        ({"physics.inertia": False}, {"inertia", "pinning"}),
+        ({"motion.files": [], "motion.validation": []}, {"inertia", "pinning"}),
+        ({"body.file": "none", "motion.files": [], "motion.validation": []}, {"collision", "inertia", "pinning"}),
+    ],
+)
+def test_what_a_scene_lacks_is_not_traced(tmp_path, plain_jax, changes, absent):
+    assembly, spec, ends, pairs = prepared(tmp_path, changes)
+    text = lowered(assembly, spec, ends, pairs)
+    assert scopes(text) == set(TERMS) - absent
+    still = changes.get("motion.files") == []
+    assert ("DynamicEncoder" in text) == (not still)
+    assert ("dynamic" in initial_state(assembly.model, assembly.network, 0).params) == (not still)
+
+
+def test_energy_falls(tmp_path, plain_jax):
+    assembly, spec, _, _ = prepared(tmp_path)
+    run = chunk_runner(assembly.network, spec)
+    state, energy = initial_state(assembly.model, assembly.network, 0), []
+    for first, count in chunks(0, 60):
+        ends = jnp.asarray(batches(assembly.track.start.shape[0], spec.batch, 0, first, count))
+        state, logs = run(state, ends, jnp.zeros_like(ends), 60, assembly.model, assembly.track)
+        energy.append(float(sum(np.mean(v) for k, v in logs.items() if k != "gravity")))
+    assert energy[-1] < 0.6 * energy[0]
+    assert int(state.dropped) == 0 and int(state.step) == 60
+    seen = glance(assembly.model, assembly.network, spec.window, state.params, assembly.track, ends[-1])
+    assert 0 <= float(seen["strain"]) < 20 and 0 <= float(seen["penetrating"]) <= 100
+
+
+def test_a_step_that_is_not_finite_is_dropped_counted_and_named(tmp_path, plain_jax):
+    assembly, spec, ends, pairs = prepared(tmp_path)
+    model = assembly.model
+    run = chunk_runner(assembly.network, spec)
+    state = initial_state(model, assembly.network, 0)
+    before = jax.tree.map(np.asarray, state.params)
+    length = model.garment.mesh.hinge_angle.at[7].set(jnp.nan)
+    mesh = dataclasses.replace(model.garment.mesh, hinge_angle=length)
+    broken = dataclasses.replace(model, garment=dataclasses.replace(model.garment, mesh=mesh))
+    state, _ = run(state, ends, pairs, 100, broken, assembly.track)
+    assert int(state.dropped) == CHUNK and int(state.step) == CHUNK
+    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params), strict=True):
+        assert np.array_equal(a, b)
+    message = diagnose(broken, assembly.network, state.params, assembly.track, state.fault)
+    assert "bending" in message and f"step {CHUNK - 1}" in message
+    vertex = int(message.split("vertex ")[1].split()[0])
+    assert vertex in np.asarray(mesh.hinges[7])
+    state, _ = run(state, ends, pairs, 100, model, assembly.track)
+    assert int(state.dropped) == CHUNK
+    assert not all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params), strict=True))
+
+
+def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, plain_jax):
+    assembly, spec, ends, pairs = prepared(tmp_path, {"training.motion_augmentation": 1.0})
+    params = initial_state(assembly.model, assembly.network, 0).params
+    grads, parts, _ = one_gradient(assembly, spec, params, ends[0], jnp.roll(jnp.arange(spec.batch), 1))
+    for name in ("static", "dynamic"):
+        assert all(np.all(np.asarray(g) == 0) for g in jax.tree.leaves(grads[name]))
+    assert any(np.any(np.asarray(g) != 0) for g in jax.tree.leaves(grads["decoder"]))
+    assert np.all(np.asarray(parts["inertia"]) == 0)
+
+
+def test_learned_skinning_weights_get_a_gradient_and_stay_weights(tmp_path, plain_jax):
+    from ncs_jax.methods.ncs import garment_blend
+
+    assembly, spec, ends, pairs = prepared(tmp_path, {"garment.learn_weights": True})
+    run = chunk_runner(assembly.network, spec)
+    state, _ = run(initial_state(assembly.model, assembly.network, 0), ends, pairs, 100, assembly.model, assembly.track)
+    learned = garment_blend(assembly.network, state.params, assembly.model).weights
+    assert float(jnp.abs(learned - assembly.model.blend.weights).max()) > 1e-5
+    np.testing.assert_allclose(learned.sum(axis=1), 1, atol=1e-6)
+    assert np.array_equal(learned == 0, assembly.model.blend.weights == 0)
+
+
+def test_batches_are_a_function_of_the_step():
+    whole = batches(17, 4, 5, 0, 12)
+    assert np.array_equal(whole[7:], batches(17, 4, 5, 7, 5))
+    assert np.array_equal(np.sort(whole.reshape(-1)[:17]), np.arange(17))
+    assert not np.array_equal(whole, batches(17, 4, 6, 0, 12))
+
+
+def test_chunks_cut_at_the_same_steps_wherever_they_begin():
+    assert list(chunks(0, 25)) == [(0, 10), (10, 10), (20, 5)]
+    assert list(chunks(10, 25)) == [(10, 10), (20, 5)]
+
+
+def test_step_size_falls_to_two_percent(tmp_path):
+    spec = load_scene(write_scene(tmp_path)).training
+    assert float(step_size(spec, 0, 100)) == pytest.approx(spec.learning_rate)
+    assert float(step_size(spec, 100, 100)) == pytest.approx(0.02 * spec.learning_rate)
