@@ -14,7 +14,7 @@ __all__ = ["angle_between", "norm", "normalize", "signed_angle"]
 
 
 def _least(dtype):
-    """The length, in the unit of the argument, under which the second derivative 1/length^2 nears the end of the type's range."""
+    """Length in the unit of the argument; under it a second derivative 1/length^2 nears the end of the range of the type."""
     return 1e-12 if dtype == jnp.float32 else 1e-100
 
 

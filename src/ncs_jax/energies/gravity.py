@@ -16,4 +16,4 @@ def gravity(x: Float[Array, "verts 3"], mass: Float[Array, "verts"], acceleratio
 
     Source: slides, equation (14).
     """
-    return -jnp.sum(mass * jnp.sum(x * acceleration, axis=-1))
+    return -jnp.sum(jnp.sum(mass[:, None] * x, axis=0) * acceleration)  # no matrix product: accelerators round those

@@ -24,8 +24,9 @@ def neo_hookean(x: Float[Array, "verts 3"], mesh: Mesh, lam, mu) -> Float[Array,
 
         E = sum_faces A [ mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2 ],  J = |w_u x w_v|
 
-    Equal to St. Venant-Kirchhoff to second order in the strain, and its uniaxial stiffness mu + (lambda + mu) s^2 is positive
-    at every stretch. Finite at zero area, where the derivative of J is taken as zero.
+    Equal to St. Venant-Kirchhoff to second order in the strain. Along one axis, with the other held at a stretch s, its
+    stiffness is mu + (lambda + mu) s^2 at every stretch; with the other free, it is positive down to half the rest length at
+    least (`tests/test_energies.py`). Finite at zero area, where the derivative of J is taken as zero.
 
     Args:
         x: (verts, 3) positions in m. mesh: rest state. lam, mu: Lame parameters times thickness, N/m.
