@@ -1,0 +1,268 @@
+"""What is drawn: the depth test, what is left out, and the pictures that a run writes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ncs_jax import pictures
+from ncs_jax.errors import InputError
+from ncs_jax.pictures import Camera, Ground, Mesh, render
+from ncs_jax.rasteriser import PAPER
+
+RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
+
+
+def tube(rings: int, around: int, radius: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder about Y, its faces outward."""
+    angle = 2 * np.pi * np.arange(around) / around
+    height = np.linspace(low, high, rings)
+    grid = np.stack(np.broadcast_arrays(radius * np.sin(angle), height[:, None], radius * np.cos(angle)), -1)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij"))
+    a, b = i * around + j, i * around + (j + 1) % around
+    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+    return grid.reshape(-1, 3), faces.astype(np.int32)
+
+
+@pytest.fixture(scope="module")
+def swing() -> dict:
+    """A ring of cloth about a leaning cylinder that walks 1 m along X in 2 s."""
+    fps, frames = 15.0, 30
+    body, body_faces = tube(12, 20, 0.15, 0.0, 1.6)
+    cloth, faces = tube(8, 24, 0.22, 0.7, 1.3)
+    t = np.arange(frames) / fps
+    lean = 0.2 * np.sin(2 * np.pi * t)[:, None]
+    shift = np.stack([0.5 * t, 0 * t, 0 * t], -1)[:, None]
+
+    def move(v, lag):
+        return np.stack([v[:, 0] + lag * v[:, 1], v[:, 1] + 0 * lag, v[:, 2] + 0 * lag], -1)
+
+    return {
+        "garment": (move(cloth, lean) + shift).astype(np.float32),
+        "garment_faces": faces,
+        "body": (move(body, 0.5 * lean) + shift).astype(np.float32),
+        "body_faces": body_faces,
+        "fps": fps,
+    }
+
+
+def square(z: float, half: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """A square that faces +Z."""
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+CAMERA = Camera((0.0, 0.0, 0.0), 1.2, elevation=0.0)
+
+
+def hue(picture: np.ndarray) -> str:
+    """Which channel leads in the middle."""
+    middle = picture[picture.shape[0] // 2, picture.shape[1] // 2].astype(int)
+    return "RGB"[middle.argmax()] if np.ptp(middle) > 20 else "-"
+
+
+@pytest.mark.parametrize("fov", [0.0, 18.0])
+@pytest.mark.parametrize("gap", [0.003, -0.003])
+def test_three_millimetres_decide_what_is_seen(fov: float, gap: float):
+    camera = Camera((0.0, 0.0, 0.0), 1.2, elevation=0.0, fov=fov)
+    meshes = [Mesh(*square(gap), RED), Mesh(*square(0.0), GREEN)]
+    for order in (meshes, meshes[::-1]):
+        assert hue(render(order, camera, (60, 60))) == ("R" if gap > 0 else "G")
+
+
+def test_depth_is_compared_at_each_pixel():
+    """Two squares that cross: painting the farther one first would get one half wrong."""
+    vertices, faces = square(0.0)
+    leaning = vertices + np.outer(vertices[:, 0], [0.0, 0.0, 0.4])
+    picture = render([Mesh(vertices, faces, RED), Mesh(leaning, faces, GREEN)], CAMERA, (80, 80)).astype(int)
+    left, right = picture[40, 20], picture[40, 60]
+    assert left.argmax() == 0 and right.argmax() == 1
+
+
+def test_neighbours_leave_no_crack():
+    vertices, faces = tube(40, 60, 0.4, -0.5, 0.5)
+    picture = render([Mesh(vertices, faces, RED)], CAMERA, (120, 120), samples=1).astype(int)
+    inner = picture[20:100, 30:90]
+    assert (inner[..., 0] - inner[..., 2] > 20).all()
+
+
+def test_the_picture_has_the_size_and_place_asked_for():
+    picture = render([Mesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 1.0, elevation=0.0, fov=0.0), (50, 100))
+    assert picture.shape == (100, 50, 3) and picture.dtype == np.uint8
+    rows, columns = np.nonzero((picture != PAPER).any(2))
+    assert (rows.min(), rows.max() + 1) == (20, 80)
+    assert (columns.min(), columns.max() + 1) == (0, 50)
+
+
+def test_width_in_sight_counts_too():
+    picture = render([Mesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 0.1, 1.0, elevation=0.0, fov=0.0), (100, 50))
+    columns = np.nonzero((picture != PAPER).any(2))[1]
+    assert (columns.min(), columns.max() + 1) == (20, 80)
+
+
+@pytest.mark.parametrize(("view", "axis"), [("front", 2), ("side", 0)])
+def test_views_look_from_where_they_say(view: str, axis: int):
+    camera = Camera((0.0, 0.0, 0.0), 1.0, azimuth=pictures.VIEWS[view], elevation=0.0)
+    assert np.argmin(camera.axes()[2]) == axis
+
+
+def test_the_inside_has_its_own_colour():
+    vertices, faces = square(0.0)
+    assert hue(render([Mesh(vertices, faces, RED, GREEN)], CAMERA, (40, 40))) == "R"
+    assert hue(render([Mesh(vertices, faces[:, ::-1], RED, GREEN)], CAMERA, (40, 40))) == "G"
+    assert hue(render([Mesh(vertices, faces[:, ::-1], RED)], CAMERA, (40, 40))) == "R"
+
+
+def test_colours_can_differ_by_vertex():
+    vertices, faces = square(0.0)
+    colour = np.where(vertices[:, :1] < 0, RED, GREEN)
+    picture = render([Mesh(vertices, faces, colour)], CAMERA, (60, 60)).astype(int)
+    assert picture[30, 10].argmax() == 0 and picture[30, 50].argmax() == 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+def test_what_is_not_finite_is_left_out(bad: float):
+    vertices, faces = square(0.0)
+    other, _ = square(0.1)
+    other[0, 1] = bad
+    picture = render([Mesh(vertices, faces, RED), Mesh(other, faces, GREEN)], CAMERA, (60, 60), ground=Ground(-0.5))
+    assert hue(picture) == "R"
+    nothing = render([Mesh(np.full((4, 3), bad), faces, RED)], CAMERA, (60, 60), ground=Ground(-0.5))
+    assert (nothing[:20] == PAPER).all()
+    assert render([], CAMERA, (10, 10)).shape == (10, 10, 3)
+
+
+def test_degenerate_triangles_are_no_error():
+    vertices = np.array([[0.0, 0, 0], [0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
+    assert (render([Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [1, 1, 1]]), RED)], CAMERA, (30, 30)) == PAPER).all()
+
+
+def test_a_garment_that_blew_up_is_drawn_in_bounded_time(rng: np.random.Generator):
+    vertices = rng.normal(size=(1000, 3)) * 3
+    faces = rng.integers(0, 1000, (2000, 3))
+    start = time.perf_counter()
+    render([Mesh(vertices, faces, RED)], Camera((0.0, 0.0, 0.0), 1.0), (400, 500))
+    assert time.perf_counter() - start < 20
+
+
+def test_shadow_falls_on_the_ground():
+    vertices, faces = tube(6, 20, 0.15, 0.05, 0.8)
+    camera = Camera((0.0, 0.4, 0.0), 1.6, elevation=20.0)
+    lit = render([], camera, (80, 80), ground=Ground(0.0, cell=0)).astype(int)
+    shaded = render([Mesh(vertices, faces, RED)], camera, (80, 80), ground=Ground(0.0, cell=0)).astype(int)
+    grey = np.ptp(shaded, axis=2) < 25  # the floor, not the tube
+    assert (lit == PAPER).all()
+    assert ((lit - shaded).min(2) > 20)[grey].sum() > 30
+
+
+def test_the_grid_stands_still_under_a_moving_camera():
+    """The same patch of floor, seen from a camera that moved by one cell, looks the same."""
+
+    def at(x):
+        return render([], Camera((x, 0.0, 0.0), 1.0, elevation=40.0), (80, 80), ground=Ground(0.0, (x, 0.0)))
+
+    assert (at(0.0) == at(0.5)).all()
+    assert (at(0.0) != at(0.25)).any()
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, -1, 0), (0, 0, -2.0), (1, 2, 3)])
+def test_upright_is_a_rotation_that_brings_up_to_y(up: tuple, rng: np.random.Generator):
+    turned = pictures.upright(np.concatenate([np.eye(3), [np.array(up) / np.linalg.norm(up)]]), up)
+    assert np.allclose(turned[3], [0, 1, 0], atol=1e-12)
+    assert np.allclose(turned[:3] @ turned[:3].T, np.eye(3), atol=1e-12) and np.linalg.det(turned[:3]) > 0
+
+
+def test_a_z_up_character_that_faces_minus_y_comes_to_face_the_front():
+    assert np.allclose(pictures.upright(np.array([[0.0, -1.0, 0.0]]), (0, 0, 1)), [[0, 0, 1]])
+
+
+def test_contact_sheet(tmp_path, swing):
+    pictures.contact_sheet(tmp_path / "a.png", **swing, frames=3, tile=120)
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    cloth = picture[..., 0] - picture[..., 2] > 60
+    # Two rows of three, each with its garment in the middle.
+    filled = cloth[: cloth.shape[0] // 2].any(0)
+    assert (np.diff(filled.astype(int)) == 1).sum() == 3
+    assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 2
+
+
+def test_contact_sheet_turns_with_the_character(tmp_path, swing):
+    """A character that has turned by 90 degrees is seen from its front all the same."""
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
+    vertices, faces = swing["garment"][0] * np.float32([1, 1, 0.4]), swing["garment_faces"]
+    garment = np.stack([vertices, vertices @ turn.T])
+    stage = pictures._stage(garment, faces, None, None, 30.0, (0, 1, 0))
+    assert stage.heading(1) == pytest.approx(90, abs=1e-3)
+    assert stage.frame_up(1, 90.0)[3] == pytest.approx(stage.frame_up(0, 0.0)[3], rel=1e-5)
+
+
+def test_animation_gif(tmp_path, swing):
+    pictures.animation_gif(tmp_path / "a.gif", **swing, max_frames=10, size=(90, 120))
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.size == (90, 120) and gif.n_frames == 10 and gif.info["loop"] == 0
+        seconds = []
+        for frame in range(gif.n_frames):
+            gif.seek(frame)
+            seconds.append(gif.info["duration"] / 1000)
+            shown = np.asarray(gif.convert("RGB"))
+            assert tuple(shown[0, 0]) == PAPER
+    assert sum(seconds) == pytest.approx(10 / 15, abs=0.01)
+
+
+def test_animation_gif_keeps_to_its_size(tmp_path, swing):
+    pictures.animation_gif(tmp_path / "a.gif", **swing, size=(90, 120), max_frames=12)
+    whole = (tmp_path / "a.gif").stat().st_size
+    pictures.animation_gif(tmp_path / "a.gif", **swing, size=(90, 120), max_frames=12, max_bytes=whole // 2)
+    assert (tmp_path / "a.gif").stat().st_size <= whole // 2
+
+
+def test_half_a_garment_that_is_nan_and_no_body(tmp_path, swing):
+    garment = swing["garment"].copy()
+    garment[5:] = np.nan
+    garment[2, 3] = 1e20
+    pictures.contact_sheet(tmp_path / "a.png", garment, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
+    pictures.animation_gif(tmp_path / "a.gif", garment, swing["garment_faces"], None, None, 15.0, max_frames=3, size=(40, 50))
+    pictures.contact_sheet(tmp_path / "b.png", garment * np.nan, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"garment": np.zeros((4, 3))}, "garment"), ({"body": np.zeros((2, 5, 3))}, "body"), ({"fps": 0.0}, "fps"),
+     ({"up": (0.0, 0.0, 0.0)}, "up"), ({"body_faces": None}, "body_faces")],
+)  # fmt: skip
+def test_arguments_that_do_not_fit_are_named(tmp_path, swing, change: dict, field: str):
+    with pytest.raises(InputError, match=field):
+        pictures.contact_sheet(tmp_path / "a.png", **{**swing, **change})
+
+
+def test_energy_curves(tmp_path):
+    pytest.importorskip("matplotlib")
+    rows = [
+        {"step": str(i), "total": str(1 + 5 / (i + 1)), "membrane": str(0.5 / (i + 1)), "gravity": "-0.2", "dropped": "0",
+         "validation_total": "1.5" if i % 5 == 0 else "", "nonsense": "abc", "strain": "nan" if i == 3 else "1.0"}
+        for i in range(30)
+    ]  # fmt: skip
+    pictures.energy_curves(tmp_path / "a.png", rows)
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.width > 1500
+    text = ",".join(rows[0]) + "\n" + "\n".join(",".join(row.values()) for row in rows)
+    (tmp_path / "log.csv").write_text(text)
+    pictures.energy_curves(tmp_path / "b.png", tmp_path / "log.csv")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    with pytest.raises(InputError, match="rows"):
+        pictures.energy_curves(tmp_path / "c.png", [{"step": "1", "other": "2"}])
+
+
+def test_matplotlib_stays_out_until_it_is_asked_for():
+    pytest.importorskip("matplotlib")
+    code = (
+        "import sys, io; from ncs_jax import pictures; early = 'matplotlib' in sys.modules;"
+        "pictures.energy_curves(io.BytesIO(), [{'step': 1, 'total': 2.0}]);"
+        "sys.exit(early or 'matplotlib.pyplot' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
