@@ -146,9 +146,9 @@ def test_rigid_motion_costs_nothing(name):
 
 # --- degenerate elements: two faces on one edge of 5 mm ---------------------------------------------------------------
 
-EDGE = [[0, 0, 0], [1, 0, 0]]
+EDGE: list = [[0, 0, 0], [1, 0, 0]]
 FLAT = [*EDGE, [0.4, 1, 0], [0.6, -1, 0]]
-DEGENERATE = {  # rest, deformed
+DEGENERATE: dict[str, tuple[list, list]] = {  # rest, deformed
     "flat": (FLAT, FLAT),
     "flat and stretched": (FLAT, np.multiply(FLAT, 1.5).tolist()),
     "folded": (FLAT, [*EDGE, [0.4, 1, 0], [0.4, 1, 0]]),

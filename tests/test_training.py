@@ -151,7 +151,7 @@ def test_a_step_that_is_not_finite_is_dropped_counted_and_named(tmp_path, plain_
 
 
 def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, plain_jax):
-    assembly, spec, ends, pairs = prepared(tmp_path, {"training.motion_augmentation": 1.0})
+    assembly, spec, ends, _ = prepared(tmp_path, {"training.motion_augmentation": 1.0})
     params = initial_state(assembly.model, assembly.network, 0).params
     grads, parts, _ = one_gradient(assembly, spec, params, ends[0], jnp.roll(jnp.arange(spec.batch), 1))
     for name in ("static", "dynamic"):

@@ -188,8 +188,7 @@ def _animate(options) -> int:
     motions = (options.motion,) if options.motion else _default_motions(run.assembly.scene)
     if not motions:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
-    motion = motions[0] if options.motion is None or options.motion.startswith("ncs:") else str(Path(motions[0]).resolve())
-    vertices = run.animate(motion, options.alpha)
+    vertices = run.animate(motions[0], options.alpha)
     io.write_animation(options.out, vertices, run.assembly.garment.faces, run.assembly.model.fps)
     print(f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices")
     return 0
@@ -199,9 +198,9 @@ def _evaluate(options) -> int:
     import numpy as np
 
     from ncs_jax import io
-    from ncs_jax.assembly import assemble, load_motion, track_of
+    from ncs_jax.assembly import assemble
     from ncs_jax.evaluation import QUANTITIES, measure, summarise
-    from ncs_jax.runs import load_run
+    from ncs_jax.runs import Run, load_run
     from ncs_jax.scene import load_scene
 
     target = Path(options.target)
@@ -210,8 +209,7 @@ def _evaluate(options) -> int:
         run = load_run(target)
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(_default_motions(run.assembly.scene)))
         for name in names:
-            path = name if options.motion is None or name.startswith("ncs:") else str(Path(name).resolve())
-            rows[name] = run.evaluate(path, options.alpha)
+            rows[name] = run.evaluate(name, options.alpha)
     else:
         if not options.scene:
             raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
@@ -220,8 +218,7 @@ def _evaluate(options) -> int:
         names = (options.motion,) if options.motion else _default_motions(scene)
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
-        path = names[0] if options.motion is None or names[0].startswith("ncs:") else str(Path(names[0]).resolve())
-        track = track_of(assembly.model, load_motion(scene, path, assembly.body))
+        track = Run(assembly, {}).track(names[0])
         expected = (track.start.shape[0], *assembly.model.garment.mesh.rest.shape)
         if animation.vertices.shape != expected:
             raise InputError(
@@ -235,12 +232,12 @@ def _evaluate(options) -> int:
     means = {name: summarise(r) for name, r in rows.items()}
     if len(means) > 1:
         means["all"] = {k: float(np.mean([m[k] for m in means.values()])) for k in next(iter(means.values()))}
-    names = [name if name.startswith("ncs:") else Path(name).stem for name in means]
-    width = max(map(len, names)) + 2
+    labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
+    width = max(map(len, labels)) + 2
     for quantity in next(iter(means.values())):
         unit, text = QUANTITIES.get(quantity, ("J", "energy"))
         print(f"{quantity} [{unit}], {text}")
-        for name, m in zip(names, means.values(), strict=True):
+        for name, m in zip(labels, means.values(), strict=True):
             print(f"  {name:{width}} {m[quantity]:.4g}")
     return 0
 

@@ -58,11 +58,11 @@ def _numbers_rate(now: Joints, previous: Joints, dt, kind: str) -> Float[Array, 
     if kind == "quaternion":  # q and -q are one rotation
         b = jnp.where(jnp.sum(a * b, axis=-1, keepdims=True) < 0, -b, b)
     if kind == "axis_angle":  # the vector jumps at half a turn, the rotation in between does not
-        step = jnp.swapaxes(previous.local, -1, -2) @ now.local
+        step = jnp.matmul(jnp.swapaxes(previous.local, -1, -2), now.local, precision="highest")
         return _numbers(step, kind) / dt
     rate = (a - b) / dt
     if kind == "heading_free":
-        turn = jnp.swapaxes(now.world[0], -1, -2) @ ((now.world[0] - previous.world[0]) / dt)
+        turn = jnp.matmul(now.world[0].T, (now.world[0] - previous.world[0]) / dt, precision="highest")
         rate = rate.at[0].set(matrix_to_six(turn))
     return rate
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,10 +74,12 @@ def _measure(model, now, previous, before, matrices):
     return lax.map(lambda frame: _frame(model, *frame), (now, previous, before, matrices))
 
 
+_SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_balance": np.median}
+
 BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
 
 
-def measure(model: Model, vertices: Float[Array, "frames verts 3"], track: Track) -> dict[str, np.ndarray]:
+def measure(model: Model, vertices: Float[Array | np.ndarray, "frames verts 3"], track: Track) -> dict[str, np.ndarray]:
     """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
 
     Args:
@@ -85,16 +89,15 @@ def measure(model: Model, vertices: Float[Array, "frames verts 3"], track: Track
     frame the garment is taken to have been at rest.
     """
     frames = len(vertices)
-    vertices = np.asarray(vertices)
+    positions = np.asarray(vertices)
     blocks = []
     for first in range(0, frames, BLOCK):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
-        three = (jnp.asarray(vertices[np.maximum(t - k, 0)]) for k in range(3))
+        three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
         blocks.append(jax.device_get(_measure(model, *three, track.matrices[t])))
     return {name: np.concatenate([b[name] for b in blocks])[:frames] for name in blocks[0]}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
     """Means over the frames; the largest for `depth_max`, the median for `out_of_balance`."""
-    special = {"depth_max": np.max, "out_of_balance": np.median}
-    return {name: float(special.get(name, np.mean)(values)) for name, values in rows.items()}
+    return {name: float(_SUMMARY.get(name, np.mean)(values)) for name, values in rows.items()}

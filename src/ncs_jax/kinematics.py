@@ -61,7 +61,7 @@ def to_rest_axes(
 
     A skeleton without rest rotations (SMPL) needs no such turn; after it, every skeleton is of that kind.
     """
-    return rest_rotations @ rotations @ jnp.swapaxes(rest_rotations, -1, -2)
+    return jnp.einsum("jab,...jbc,jdc->...jad", rest_rotations, rotations, rest_rotations, precision="highest")
 
 
 def forward(skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], translation: Float[Array, "*frames 3"]) -> Pose:
@@ -87,15 +87,15 @@ def forward(skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], t
         above = place[parents[here]]
         turned = world[..., above, :, :]
         bone = skeleton.joints[here] - skeleton.joints[parents[here]]
-        offset = jnp.einsum("...jab,jb->...ja", turned, bone)
+        offset = jnp.einsum("...jab,jb->...ja", turned, bone, precision="highest")
         position = jnp.concatenate([position, position[..., above, :] + offset], axis=-2)
-        world = jnp.concatenate([world, turned @ rotations[..., here, :, :]], axis=-3)
+        world = jnp.concatenate([world, jnp.matmul(turned, rotations[..., here, :, :], precision="highest")], axis=-3)
     return Pose(world[..., place, :, :], position[..., place, :])
 
 
 def transforms(skeleton: Skeleton, pose: Pose) -> Float[Array, "*frames joints 3 4"]:
     """Rigid motion [R_j | p_j - R_j J_j] of every joint from rest to pose."""
-    shift = pose.positions - jnp.einsum("...jab,jb->...ja", pose.rotations, skeleton.joints)
+    shift = pose.positions - jnp.einsum("...jab,jb->...ja", pose.rotations, skeleton.joints, precision="highest")
     return jnp.concatenate([pose.rotations, shift[..., None]], axis=-1)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 __all__ = ["laplacian", "modal_basis"]
 
@@ -27,8 +26,8 @@ def laplacian(vertices: np.ndarray, faces: np.ndarray):
 
 
 def modal_basis(
-    vertices: np.ndarray, faces: np.ndarray, area: np.ndarray, count: int, amplitude: float = 0.02, dtype=jnp.float32
-) -> Float[Array, "verts modes"]:
+    vertices: np.ndarray, faces: np.ndarray, area: np.ndarray, count: int, amplitude: float = 0.02
+) -> Float[np.ndarray, "verts modes"]:
     """The `count` smoothest modes of a garment, each with the displacement that costs about the same membrane energy.
 
         b_i = amplitude u_i / sqrt(1 + lambda_i / lambda_ref),  L u_i = lambda_i M u_i,  mean square of u_i = 1 over the area
@@ -57,4 +56,4 @@ def modal_basis(
         values, vectors = eigsh(matrix, count, diags(mass).tocsc(), sigma=-reference / 10, which="LM", v0=start)
     vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(count)] < 0, -1, 1)
     scale = amplitude * np.sqrt(area.sum()) / np.sqrt(1 + np.maximum(values, 0) / reference)
-    return jnp.asarray(vectors * scale, dtype)
+    return (vectors * scale).astype(np.float32)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 __all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge"]
@@ -16,13 +18,15 @@ class StaticEncoder(nn.Module):
     """z_S from the static descriptors of one frame: a multilayer perceptron."""
 
     sizes: Sequence[int] = (64, 128, 256, 512)
+    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch code"]:
         """Code of `(..., joints, numbers)` descriptors; each frame by itself."""
         h = descriptor.reshape(*descriptor.shape[:-2], -1)
         for i, size in enumerate(self.sizes):
-            h = nn.relu(nn.Dense(size, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")(h))
+            layer = nn.Dense(size, param_dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")
+            h = nn.relu(layer(h))
         return h
 
 
@@ -36,14 +40,16 @@ class DynamicEncoder(nn.Module):
     joint_sizes: Sequence[int] = (32, 32)
     sizes: Sequence[int] = (512, 512)
     state: int = 512
+    dtype: DTypeLike = jnp.float32
 
     def setup(self):
         """Create the layers."""
+        dense = functools.partial(nn.Dense, use_bias=False, param_dtype=self.dtype)
         he = nn.initializers.he_normal()
-        self.per_joint = [nn.Dense(n, use_bias=False, kernel_init=he) for n in self.joint_sizes]
-        self.joined = [nn.Dense(n, use_bias=False, kernel_init=he) for n in self.sizes]
-        self.gates_in = nn.Dense(3 * self.state, use_bias=False)
-        self.recurrent = self.param("recurrent", nn.initializers.orthogonal(), (self.state, 3 * self.state))
+        self.per_joint = [dense(n, kernel_init=he) for n in self.joint_sizes]
+        self.joined = [dense(n, kernel_init=he) for n in self.sizes]
+        self.gates_in = dense(3 * self.state)
+        self.recurrent = self.param("recurrent", nn.initializers.orthogonal(), (self.state, 3 * self.state), self.dtype)
 
     def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch gates"]:
         """What the recurrence reads, frame by frame: everything that needs no state."""
@@ -91,14 +97,15 @@ class Decoder(nn.Module):
     sizes: Sequence[int] = (512, 512, 512)
     modes: int = 128
     local: float = 0.005
+    dtype: DTypeLike = jnp.float32
 
     def setup(self):
         """Create the layers."""
-        he = nn.initializers.he_normal()
-        self.layers = [nn.Dense(n, kernel_init=he) for n in self.sizes]
-        self.offsets = nn.Dense(3 * self.verts, kernel_init=nn.initializers.normal(0.3 / self.sizes[-1] ** 0.5))
+        dense = functools.partial(nn.Dense, param_dtype=self.dtype)
+        self.layers = [dense(n, kernel_init=nn.initializers.he_normal()) for n in self.sizes]
+        self.offsets = dense(3 * self.verts, kernel_init=nn.initializers.normal(0.3 / self.sizes[-1] ** 0.5))
         if self.modes:
-            self.coefficients = nn.Dense(3 * self.modes, kernel_init=nn.initializers.zeros)
+            self.coefficients = dense(3 * self.modes, kernel_init=nn.initializers.zeros)
 
     def __call__(self, code: Float[Array, "*batch code"], basis: Float[Array, "verts modes"]) -> Float[Array, "*batch verts 3"]:
         """Offsets (..., verts, 3) in m to add to the rest garment."""
@@ -124,4 +131,4 @@ def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) ->
 
     offsets = {name: whole(local[name], modal[name]) for name in ("kernel", "bias")}
     kept = {name: value for name, value in params.items() if name != "coefficients"}
-    return Decoder(decoder.verts, decoder.sizes, 0, 1.0), {**kept, "offsets": offsets}
+    return Decoder(decoder.verts, decoder.sizes, 0, 1.0, decoder.dtype), {**kept, "offsets": offsets}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -31,7 +32,7 @@ from ncs_jax.mesh import Mesh
 
 __all__ = ["MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "total"]
 
-MEMBRANES = {
+MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
     "stvk": (stvk, ("lam", "mu")),
     "neo_hookean": (neo_hookean, ("lam", "mu")),
     "baraff_witkin": (baraff_witkin, ("stretch", "shear")),

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
-from ncs_jax.assembly import load_motion
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import summarise
 from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
@@ -59,7 +58,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     faces = run.assembly.garment.faces
     body_vertices = body_faces = None
     if body is not None:
-        body_vertices, body_faces = posed_body(body, load_motion(scene, name, body)), body.faces
+        body_vertices, body_faces = posed_body(body, run.motion(name)), body.faces
     fps = run.assembly.model.fps
     quantities = summarise(run.evaluate(track))
     facts = {

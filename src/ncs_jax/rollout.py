@@ -70,7 +70,7 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
             d = descriptors.dynamic(now, previous, before, g, 1 / model.fps, model.descriptor)
             variables = {"params": params["dynamic"]}
             features = network.dynamic.apply(variables, d, method="features")
-            code = network.dynamic.apply(variables, code, features, method="step")
+            code = jnp.asarray(network.dynamic.apply(variables, code, features, method="step"))
             z = z + alpha * code
         offsets = decode(network, params, model, z)
         x = skin(blend(transforms(model.skeleton, pose), weights), rest + offsets)
@@ -82,7 +82,7 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
 def dynamic_codes(network: NCS, params: dict, track: Track) -> Float[Array, "frames code"]:
     """z_D of every frame of one motion, from rest at its start."""
     rest = jnp.zeros(network.dynamic.state, track.dynamic.dtype)
-    return network.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest)
+    return jnp.asarray(network.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest))
 
 
 def animate(

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.errors import InputError
@@ -52,9 +53,16 @@ class Run:
     steps: int = 0
 
     def track(self, motion: str) -> Track:
-        """A motion file or `ncs:NAME`, ready to animate."""
+        """A motion file, `ncs:NAME` or a motion as the scene names it, ready to animate."""
+        return track_of(self.assembly.model, self.motion(motion))
+
+    def motion(self, name: str) -> io.MotionRecord:
+        """A motion at the scene's frame rate; a path that the scene does not name is taken from the current folder."""
         a = self.assembly
-        return track_of(a.model, a.motions.get(motion) or load_motion(a.scene, motion, a.body))
+        if name in a.motions:
+            return a.motions[name]
+        known = name.startswith("ncs:") or name in (*a.scene.motion.files, *a.scene.motion.validation)
+        return load_motion(a.scene, name if known else str(Path(name).absolute()), a.body)
 
     def animate(self, motion: str | Track, alpha: float = 1.0) -> np.ndarray:
         """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves."""
@@ -62,7 +70,7 @@ class Run:
         frames = track.start.shape[0]
         # The last frame is repeated up to a whole number of blocks: motions of many lengths share a compilation.
         padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % BLOCK)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
-        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, padded, alpha))[:frames]
+        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, padded, float(alpha)))[:frames]
 
     def evaluate(self, motion: str | Track, alpha: float = 1.0) -> dict[str, np.ndarray]:
         """Physical quantities per frame, see `evaluation.QUANTITIES`."""

@@ -147,11 +147,11 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         return decode(network, params, model, z[-1]), z
 
     last, transpose, z = jax.vjp(last_frame, params, has_aux=True)
-    offsets = [last]
+    frames = [last]
     if history > 1:
         earlier = decode(network, params, model, z[:-1])
-        offsets += [earlier[1], earlier[0]]
-    offsets = jnp.stack(offsets, axis=1)
+        frames += [earlier[1], earlier[0]]
+    offsets = jnp.stack(frames, axis=1)
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, 0)
     share = (jnp.arange(ends.shape[0]) >= augmented).astype(offsets.dtype)

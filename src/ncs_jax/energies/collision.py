@@ -180,11 +180,11 @@ def _smallest(values, count):
     rows = jnp.arange(len(values), dtype=jnp.int32)[:, None]
 
     def take(left, _):
-        least = left.min(axis=0)
-        row = jnp.where(left == least, rows, len(values) - 1).min(axis=0)
-        return jnp.where(rows == row, jnp.inf, left), (row, least)
+        least = left.min(axis=0, keepdims=True)
+        row = jnp.where(left == least, rows, len(values) - 1).min(axis=0, keepdims=True)
+        return jnp.where(rows == row, jnp.inf, left), row[0]
 
-    left, (chosen, _) = lax.scan(take, values, None, length=count)
+    left, chosen = lax.scan(take, values, None, length=count)
     return chosen, left.min(axis=0)
 
 
@@ -198,7 +198,7 @@ def _candidates(x, features, blocks, surface, squared):
     corners = grouped.reshape(len(blocks), -1, 3)
     cloth = x[surface.cloth_blocks]
     low, high = corners.min(axis=1), corners.max(axis=1)
-    gap = jnp.maximum(jnp.maximum(low - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high), 0)
+    gap = jnp.maximum(jnp.maximum(low[None] - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high[None]), 0)
     chosen, bound = _smallest(jnp.sum(gap * gap, axis=-1).T, min(surface.groups, len(blocks)))
     chosen = chosen.T
     listed = grouped[chosen].reshape(len(cloth), -1, *features.shape[1:])

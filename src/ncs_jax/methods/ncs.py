@@ -52,14 +52,16 @@ def garment_blend(network: NCS, params: dict, model: Model) -> Blend:
     return Blend(scaled / jnp.sum(scaled, axis=-1, keepdims=True), model.blend.joints)
 
 
-def static_codes(network: NCS, params: dict, descriptors: Float[Array, "*frames joints numbers"]):
+def static_codes(
+    network: NCS, params: dict, descriptors: Float[Array, "*frames joints numbers"]
+) -> Float[Array, "*frames code"]:
     """z_S of single frames."""
-    return network.static.apply({"params": params["static"]}, descriptors)
+    return jnp.asarray(network.static.apply({"params": params["static"]}, descriptors))
 
 
 def decode(network: NCS, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "*frames verts 3"]:
     """Offsets in unposed space, m."""
-    return network.decoder.apply({"params": params["decoder"]}, code, model.basis)
+    return jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
 
 
 def for_inference(network: NCS, params: dict, model: Model) -> tuple[NCS, dict]:
@@ -83,5 +85,5 @@ def window_codes(
         return z_static, None
     moving = jnp.where((back >= start[None])[..., None, None], track.dynamic[inside], 0)
     rest = jnp.zeros((ends.shape[0], network.dynamic.state), moving.dtype)
-    z_dynamic = network.dynamic.apply({"params": params["dynamic"]}, moving, rest)
+    z_dynamic = jnp.asarray(network.dynamic.apply({"params": params["dynamic"]}, moving, rest))
     return z_static, z_dynamic[length - last :]

@@ -1,0 +1,140 @@
+"""Run folders: a run killed at any moment and resumed ends at the weights of the unbroken one."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ncs_jax.errors import InputError
+from ncs_jax.runs import load_run, train
+
+from .scenes import write_scene
+
+STEPS = 60
+SOURCE = Path(__file__).parents[1] / "src"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Compiled programs, shared by the processes of these tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+def command(scene, out, cache, *more):
+    environment = {**os.environ, "PYTHONPATH": str(SOURCE), "JAX_COMPILATION_CACHE_DIR": str(cache)}
+    line = [sys.executable, "-m", "ncs_jax.cli", "train", str(scene), "--out", str(out), "--steps", str(STEPS), *more]
+    return subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(process):
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+
+
+def leaves(out):
+    return [np.asarray(p) for p in jax.tree.leaves(load_run(out).params)]
+
+
+def same(a, b):
+    return all(np.array_equal(p, q) for p, q in zip(leaves(a), leaves(b), strict=True))
+
+
+def writing(out):
+    """Whether a checkpoint is being written right now."""
+    folder = out / "checkpoints"
+    return folder.is_dir() and any("tmp" in p.name for p in folder.iterdir())
+
+
+def kill_while(process, out, when, limit=120):
+    """SIGKILL as soon as `when()` holds; whether it came to that."""
+    end = time.monotonic() + limit
+    while process.poll() is None and time.monotonic() < end:
+        if when():
+            process.send_signal(signal.SIGKILL)
+            process.communicate()
+            return True
+        time.sleep(0.0005)
+    process.communicate()
+    return False
+
+
+def killed_and_resumed(folder, scene, cache, kills):
+    """Kill a run by each of `kills` in turn (seconds after its start, or "write"), then let it finish."""
+    out, done = folder / "killed", []
+    for kill in kills:
+        process = command(scene, out, cache, *(["--resume"] if (out / "run.json").exists() else []))
+        start = time.monotonic()
+        when = (lambda: writing(out)) if kill == "write" else (lambda s=start, k=kill: time.monotonic() - s > k)
+        done.append(kill_while(process, out, when))
+    if (out / "run.json").exists():
+        finish(command(scene, out, cache, "--resume"))
+    else:
+        finish(command(scene, out, cache))
+    return out, done
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory, cache):
+    folder = tmp_path_factory.mktemp("unbroken")
+    scene = write_scene(folder)
+    out = folder / "run"
+    start = time.monotonic()
+    finish(command(scene, out, cache))
+    start, again = time.monotonic(), folder / "again"
+    finish(command(scene, again, cache))
+    return scene, out, again, time.monotonic() - start
+
+
+def test_a_seed_makes_a_run_repeatable_bit_for_bit(unbroken, plain_jax):
+    scene, out, again, _ = unbroken
+    assert same(out, again)
+    other = train(scene, None, steps=STEPS, seed=1)
+    assert not all(np.array_equal(a, b) for a, b in zip(leaves(out), jax.tree.leaves(other.params), strict=True))
+
+
+def test_killed_within_a_write_and_resumed(unbroken, tmp_path, cache, plain_jax):
+    scene, reference, _, seconds = unbroken
+    out, done = killed_and_resumed(tmp_path, scene, cache, ["write", 0.8 * seconds])
+    assert done[0]
+    assert same(out, reference)
+    with (out / "log.csv").open() as file:
+        steps = [int(row["step"]) for row in csv.DictReader(file)]
+    assert steps == list(range(10, STEPS + 1, 10))
+
+
+@pytest.mark.slow
+def test_killed_at_ten_moments_and_resumed(unbroken, tmp_path, cache, plain_jax):
+    scene, reference, _, seconds = unbroken
+    moments = np.random.default_rng(7).uniform(0.1, 0.95, 8) * seconds
+    kills = [*moments[:3], "write", *moments[3:6], "write", *moments[6:]]
+    out, done = killed_and_resumed(tmp_path, scene, cache, kills)
+    print("killed:", [(k if k == "write" else round(float(k), 2), d) for k, d in zip(kills, done, strict=True)])
+    assert sum(d for k, d in zip(kills, done, strict=True) if k == "write") == 2
+    assert same(out, reference)
+
+
+def test_a_run_is_not_overwritten(tmp_path, plain_jax):
+    scene, out = write_scene(tmp_path), tmp_path / "run"
+    train(scene, out, steps=10)
+    with pytest.raises(InputError, match="--resume"):
+        train(scene, out, steps=10)
+    with pytest.raises(InputError, match="no run to resume"):
+        train(scene, tmp_path / "other", steps=10, resume=True)
+    run = load_run(out)
+    assert run.steps == 10
+    vertices = run.animate(str(tmp_path / "swing.npz"), alpha=1)
+    assert vertices.shape == (24, 30, 3) and np.isfinite(vertices).all()
+
+
+def test_minutes_choose_the_steps(tmp_path, plain_jax):
+    seen = []
+    run = train(write_scene(tmp_path), tmp_path / "run", minutes=0.2, report=seen.append)
+    assert seen[-1].step == seen[-1].steps == run.steps and run.steps % 10 == 0
+    assert seen[-1].validation is not None and seen[-1].left == 0
