@@ -39,7 +39,8 @@ def prepared(folder, changes=(), dtype=jnp.float32):
 
 
 def one_gradient(assembly, spec, params, ends, pairs):
-    return gradients(assembly.model, assembly.network, spec, params, assembly.track, ends, pairs)
+    f = jax.jit(lambda model, params, track: gradients(model, assembly.network, spec, params, track, ends, pairs))
+    return f(assembly.model, params, assembly.track)
 
 
 def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
@@ -67,7 +68,7 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
             result += total(x[2], model.garment, model.material, frame, model.terms, model.surface)
         return result / len(ends)
 
-    value, expected = jax.value_and_grad(loss)(params)
+    value, expected = jax.jit(jax.value_and_grad(loss))(params)
     found, parts, _ = one_gradient(assembly, spec, params, ends, pairs[0])
     np.testing.assert_allclose(sum(np.mean(p) for p in parts.values()), value, rtol=1e-12)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):

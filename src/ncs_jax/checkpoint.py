@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,19 @@ import numpy as np
 from ncs_jax.assembly import Prepared
 from ncs_jax.errors import InputError
 
-__all__ = ["Checkpoints", "read_prepared", "read_run", "write_prepared", "write_run"]
+__all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
+
+
+def check_writable(run: Path) -> None:
+    """See, before anything is worked out, that a run folder can be made.
+
+    Raises:
+        InputError: it cannot.
+    """
+    there = next(p for p in (run, *run.absolute().parents) if p.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        kind = "is not a folder" if not there.is_dir() else "may not be written to"
+        raise InputError(f"a folder that can be written expected: {there} {kind}", file=run, mend="choose another --out")
 
 
 def write_run(run: Path, facts: dict) -> None:
@@ -75,7 +88,7 @@ def read_prepared(run: Path) -> Prepared:
     """
     path = Path(run) / "prepared.npz"
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             return Prepared(**{f.name: data[f.name] for f in dataclasses.fields(Prepared)})
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"cannot be read: {error}", file=path, mend="train again into a new folder") from None
@@ -88,22 +101,45 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True)
-        self._manager = ocp.CheckpointManager((Path(run) / "checkpoints").absolute(), options=options)
+        self._folder = (Path(run) / "checkpoints").absolute()
+        self._manager = ocp.CheckpointManager(self._folder, options=options)
         self._args = ocp.args
 
     def save(self, step: int, state: Any) -> None:
-        """Write the state after `step` steps."""
-        self._manager.save(step, args=self._args.StandardSave(state))
-        self._manager.wait_until_finished()
+        """Write the state after `step` steps.
+
+        Raises:
+            InputError: the disk is full, or the folder is gone.
+        """
+        try:
+            self._manager.save(step, args=self._args.StandardSave(state))
+            self._manager.wait_until_finished()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            mend = "make room and go on with --resume; the checkpoint before this one is whole"
+            raise InputError(
+                f"the checkpoint of step {step} cannot be written: {reason}", file=self._folder, mend=mend
+            ) from None
 
     def latest(self) -> int | None:
         """The newest whole checkpoint's step."""
         return self._manager.latest_step()
 
     def restore(self, like: Any) -> Any:
-        """The newest state, with the shapes and types of `like`."""
+        """The newest state, with the shapes and types of `like`.
+
+        Raises:
+            InputError: it is damaged, or of another network.
+        """
         shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), like)
-        return self._manager.restore(self.latest(), args=self._args.StandardRestore(shapes))
+        step = self.latest()
+        try:
+            return self._manager.restore(step, args=self._args.StandardRestore(shapes))
+        except Exception as error:  # Orbax and its store have no common error class
+            sys.unraisablehook = lambda _: None  # the arrays still being read complain one by one that nobody waits for them
+            reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            mend = "delete this folder to go back to the checkpoint before it"
+            raise InputError(f"the checkpoint cannot be read: {reason}", file=self._folder / str(step), mend=mend) from error
 
     def close(self) -> None:
         """Wait for pending writes."""

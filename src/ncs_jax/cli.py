@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -57,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints and logs")
     train.add_argument("--steps", type=_whole, help="optimiser steps (default: the scene's)")
     train.add_argument("--minutes", type=_positive, help="train for about this long instead of a number of steps")
-    train.add_argument("--seed", type=int, help="seed (default: the scene's)")
+    train.add_argument("--seed", type=_seed, help="seed (default: the scene's)")
     train.add_argument("--resume", action="store_true", help="go on with the run in --out from its last checkpoint")
     train.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
 
@@ -65,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     animate.add_argument("folder", metavar="RUN", help="folder that ncs train made")
     animate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
     animate.add_argument(
-        "--alpha", type=float, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates"
+        "--alpha", type=_finite, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates"
     )
     animate.add_argument("--out", required=True, metavar="FILE", help=".npz, .h5, .pc2, or a folder of .obj")
 
@@ -73,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
     evaluate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's)")
     evaluate.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
-    evaluate.add_argument("--alpha", type=float, default=1.0, help="motion control")
+    evaluate.add_argument("--alpha", type=_finite, default=1.0, help="motion control")
     evaluate.add_argument("--json", action="store_true", help="print JSON, with every frame")
 
     check = command("check", _check, "read and assemble a scene without training it")
@@ -102,6 +103,20 @@ def _whole(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"a whole number from 1 expected, found {text}")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {2**31 - 1} expected, found {text}")
+    return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"a finite number expected, found {text}")
     return value
 
 
@@ -204,6 +219,8 @@ def _evaluate(options) -> int:
     from ncs_jax.scene import load_scene
 
     target = Path(options.target)
+    if not target.exists():
+        raise InputError("no such run folder or animation", file=target, mend="check the path")
     rows = {}
     if target.is_dir() and not options.scene:
         run = load_run(target)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
-from ncs_jax.checkpoint import Checkpoints, read_prepared, read_run, write_prepared, write_run
+from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
@@ -134,6 +134,8 @@ def train(
         scene = scene_from(facts["scene"], source=str(out / "run.json"))
     elif resume:
         raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
+    if out is not None:
+        check_writable(out)
     assembly = assemble(scene)
     spec, model, network, track = scene.training, assembly.model, assembly.network, assembly.track
     seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
@@ -149,24 +151,37 @@ def train(
     if out is not None and facts is None:
         write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict()})
         write_prepared(out, assembly.prepared)
+    state = initial_state(model, network, seed)
+    checkpoints = None if out is None else Checkpoints(out)
+    every = -(-spec.checkpoint_every // CHUNK) * CHUNK
+    check = -(-spec.validate_every // CHUNK) * CHUNK
     if facts is not None and facts["steps"]:
         steps = facts["steps"]
     elif minutes is not None:
-        steps = _fitting_steps(began, minutes, lambda n, s: run_chunk(s, *indices(0, n), n, model, track), model, network)
+
+        def chunk(state):
+            state, _ = run_chunk(state, *indices(0, CHUNK), CHUNK, model, track)
+            look(model, state.params, track, jnp.arange(4) % frames)
+            return jax.block_until_ready(state)
+
+        pace = _seconds(chunk, initial_state(model, network, seed)) / CHUNK
+        if scene.motion.validation:
+            pace += _seconds(lambda s: _validate(Run(assembly, s.params)) and s, state) / check
+        if checkpoints is not None and checkpoints.latest() is None:
+            start = time.monotonic()
+            checkpoints.save(0, state)
+            pace += (time.monotonic() - start) / every
+        steps = max(CHUNK, int((60 * minutes - (time.monotonic() - began)) / (1.05 * pace)) // CHUNK * CHUNK)
     else:
         steps = steps or spec.steps
     if out is not None and (facts is None or not facts["steps"]):
         facts = {"steps": steps, "seed": seed, "scene": scene.to_dict(), "versions": _versions()}
         write_run(out, facts)
 
-    state = initial_state(model, network, seed)
-    checkpoints = None if out is None else Checkpoints(out)
     if resume and checkpoints is not None and checkpoints.latest() is not None:
         state = checkpoints.restore(state)
     first = int(state.step)
     log = None if out is None else _Log(out, first)
-    every = -(-spec.checkpoint_every // CHUNK) * CHUNK
-    check = -(-spec.validate_every // CHUNK) * CHUNK
     dropped, started, pace = int(state.dropped), time.monotonic(), None
     for at, count in chunks(first, steps):
         ends, pairs = indices(at, count)
@@ -197,26 +212,18 @@ def train(
         if checkpoints is not None and (done % every == 0 or done == steps):
             checkpoints.save(done, state)
     if checkpoints is not None:
-        if checkpoints.latest() is None:
-            checkpoints.save(int(state.step), state)
         checkpoints.close()
     if log is not None:
         log.close()
     return Run(assembly, state.params, steps)
 
 
-def _fitting_steps(began: float, minutes: float, run, model, network) -> int:
-    """How many steps fit, from the pace of two chunks after the compiling one, on a state that is then thrown away."""
-    state = initial_state(model, network, 0)
-    state, _ = run(CHUNK, state)
-    jax.block_until_ready(state)
+def _seconds(work: Callable, state) -> float:
+    """How long `work(state) -> state` takes once it is compiled: the mean of two further goes."""
+    state = work(state)
     start = time.monotonic()
-    for _ in range(2):
-        state, _ = run(CHUNK, state)
-    jax.block_until_ready(state)
-    now = time.monotonic()
-    pace = (now - start) / (2 * CHUNK)
-    return max(CHUNK, int((60 * minutes - (now - began)) / (1.05 * pace)) // CHUNK * CHUNK)
+    work(work(state))
+    return (time.monotonic() - start) / 2
 
 
 def _validate(run: Run) -> dict[str, float]:

@@ -69,12 +69,13 @@ def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
     return spec.learning_rate * (0.02 + 0.98 * (1 + jnp.cos(jnp.pi * fall)) / 2)
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
     """Fresh parameters and a fresh optimiser."""
     params = initial_parameters(network, jax.random.PRNGKey(seed), model)
-    count = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one buffer each: a step is given them to reuse
-    fault = Fault(count(), count(), jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
-    return TrainState(params, ADAM.init(params), count(), count(), fault)
+    zero = jnp.zeros((), jnp.int32)
+    fault = Fault(zero, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
+    return TrainState(params, ADAM.init(params), zero, zero, fault)
 
 
 def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
@@ -242,9 +243,9 @@ def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> 
     last = fault.offsets[0]
     if not bool(jnp.all(jnp.isfinite(last))):
         return f"step {int(fault.step)}, frame {frame}: the network's own output is not finite"
-    _, parts = value(last, weights)
+    parts = jax.jit(lambda o: value(o, weights)[1])(last)
     for name, energy in parts.items():
-        gradient = jax.grad(lambda o, n=name: value(o, weights)[1][n])(last)
+        gradient = jax.jit(jax.grad(lambda o, n=name: value(o, weights)[1][n]))(last)
         bad = ~np.isfinite(np.asarray(gradient)).all(axis=1)
         if not np.isfinite(float(energy)) or bad.any():
             vertex = int(bad.argmax()) if bad.any() else -1

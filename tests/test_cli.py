@@ -1,0 +1,349 @@
+"""The commands: what they print and write, and one line with exit code 2 for every broken input."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ncs_jax import io
+from ncs_jax.cli import main
+from ncs_jax.runs import train
+
+from .scenes import grid, post, swing, write_scene
+
+
+@pytest.fixture(autouse=True)
+def _plain(plain_jax):
+    yield
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A run that was trained for a moment; (scene file, run folder)."""
+    import jax
+
+    folder = tmp_path_factory.mktemp("trained")
+    scene = write_scene(folder)
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        train(scene, folder / "run", steps=10)
+    return scene, folder / "run"
+
+
+def truncated(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def rewrite(path, **arrays):
+    with np.load(path) as old:
+        np.savez(path, **{**dict(old), **arrays})
+
+
+def edited(scene, old, new):
+    text = scene.read_text()
+    assert old in text
+    scene.write_text(text.replace(old, new))
+
+
+def truncated_npz(folder, scene):
+    truncated(folder / "body.npz")
+    return ["body.npz"]
+
+
+def nan_in_a_pose(folder, scene):
+    poses = swing()["poses"]
+    poses[7, 1, 2] = np.nan
+    rewrite(folder / "swing.npz", poses=poses)
+    return ["swing.npz", "poses", "nan", "7"]
+
+
+def wrong_joint_count(folder, scene):
+    rewrite(folder / "swing.npz", **swing(joints=3))
+    return ["swing.npz", "poses", "3 joints", "2 joints expected"]
+
+
+def quaternion_of_zero_length(folder, scene):
+    quaternions = np.zeros((24, 2, 4))
+    quaternions[..., 0] = 1
+    quaternions[5, 1] = 0
+    np.savez(folder / "swing.npz", quaternions=quaternions, trans=np.zeros((24, 3)), fps=30.0)
+    return ["swing.npz", "quaternions", "5"]
+
+
+def empty_mesh(folder, scene):
+    np.savez(folder / "cloth.npz", vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), np.int32))
+    return ["cloth.npz"]
+
+
+def non_manifold_mesh(folder, scene):
+    vertices, faces = grid()
+    np.savez(folder / "cloth.npz", vertices=vertices, faces=np.concatenate([faces, faces[:1, ::-1], faces[:1]]))
+    return ["cloth.npz", "faces"]
+
+
+def faces_out_of_range(folder, scene):
+    vertices, faces = grid()
+    faces[3, 1] = len(vertices)
+    np.savez(folder / "cloth.npz", vertices=vertices, faces=faces)
+    return ["cloth.npz", "faces", str(len(vertices))]
+
+
+def missing_file(folder, scene):
+    (folder / "cloth.npz").unlink()
+    return ["cloth.npz"]
+
+
+def unwritable_output_folder(folder, scene):
+    (folder / "run").write_text("in the way")  # no folder can be made below a file, whoever tries
+    edited(scene, "steps = 40", "steps = 41")
+    return ["run", "folder that can be written", "--out"]
+
+
+def unknown_key(folder, scene):
+    edited(scene, "smoothing", "smothing")
+    return ["scene.toml", "garment.smothing", "did you mean smoothing"]
+
+
+def not_toml(folder, scene):
+    scene.write_text("[body\n")
+    return ["scene.toml", "TOML"]
+
+
+def wrong_type(folder, scene):
+    edited(scene, "batch = 4", 'batch = "four"')
+    return ["scene.toml", "training.batch", "four", "whole number"]
+
+
+def out_of_range(folder, scene):
+    edited(scene, "batch = 4", "batch = 0")
+    return ["scene.toml", "training.batch", "0", "from 1"]
+
+
+def garment_in_centimetres(folder, scene):
+    vertices, faces = grid()
+    np.savez(folder / "cloth.npz", vertices=100 * vertices, faces=faces)
+    return ["cloth.npz", "vertices", "metres", "divide by 100"]
+
+
+def garment_elsewhere(folder, scene):
+    vertices, faces = grid(origin=(0.0, 3.0, 0.0))
+    np.savez(folder / "cloth.npz", vertices=vertices, faces=faces)
+    return ["cloth.npz", "on the body"]
+
+
+def translation_in_centimetres(folder, scene):
+    rewrite(folder / "swing.npz", trans=swing()["trans"] * 10000)
+    return ["swing.npz", "trans", "metres"]
+
+
+def no_such_joint(folder, scene):
+    edited(scene, 'file = "body.npz"', 'file = "body.npz"\njoints = ["2"]')
+    return ["scene.toml", "body.joints[0]", "2", "0 to 1"]
+
+
+def no_such_pins(folder, scene):
+    edited(scene, "smoothing = 2", 'pins = "collar"')
+    return ["scene.toml", "garment.pins", "collar", "pins"]
+
+
+BROKEN = [
+    truncated_npz,
+    nan_in_a_pose,
+    wrong_joint_count,
+    quaternion_of_zero_length,
+    empty_mesh,
+    non_manifold_mesh,
+    faces_out_of_range,
+    missing_file,
+    unwritable_output_folder,
+    unknown_key,
+    not_toml,
+    wrong_type,
+    out_of_range,
+    garment_in_centimetres,
+    garment_elsewhere,
+    translation_in_centimetres,
+    no_such_joint,
+    no_such_pins,
+]
+
+
+def one_line(capsys, words):
+    output = capsys.readouterr()
+    line = output.err.strip()
+    assert line.startswith("ncs: ") and "\n" not in line and "Traceback" not in output.err + output.out, output
+    for word in words:
+        assert word in line, (word, line)
+
+
+@pytest.mark.parametrize("broken", BROKEN, ids=lambda f: f.__name__)
+def test_broken_input_is_one_line_and_exit_code_2(tmp_path, capsys, broken):
+    scene = write_scene(tmp_path)
+    words = broken(tmp_path, scene)
+    before = {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
+    assert main(["train", str(scene), "--out", str(tmp_path / "run" / "deeper")]) == 2
+    one_line(capsys, words)
+    assert {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before
+    assert not (tmp_path / "run").is_dir()
+
+
+def process(*arguments):
+    source = str(Path(__file__).parents[1] / "src")
+    line = [sys.executable, "-m", "ncs_jax.cli", *map(str, arguments)]
+    return subprocess.run(line, env={**os.environ, "PYTHONPATH": source}, capture_output=True, text=True, check=False)
+
+
+def test_a_real_process_exits_with_2(tmp_path):
+    scene = write_scene(tmp_path)
+    truncated(tmp_path / "cloth.npz")
+    done = process("check", scene)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith(f"ncs: {tmp_path / 'cloth.npz'}")
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["check", "nowhere.toml"], ["nowhere.toml", "no such scene"]),
+        (["check", "ncs:nothing"], ["ncs:nothing", "ncs:tshirt"]),
+        (["animate", "nowhere", "--out", "a.npz"], ["nowhere", "run"]),
+        (["evaluate", "nowhere"], ["nowhere"]),
+        (["train", "ncs:tshirt", "--out", "nowhere", "--resume"], ["nowhere", "--resume"]),
+    ],
+)
+def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    one_line(capsys, words)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["", "fly", "train ncs:tshirt", "train a --out b --steps 0", "train a --out b --seed=-1", "animate a --out b --alpha nan",
+     "demo --minutes 0"],
+)  # fmt: skip
+def test_wrong_options(capsys, arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments.split())
+    assert stop.value.code == 2
+    assert "usage: ncs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["demo", "train", "animate", "evaluate", "check"])
+def test_help_explains_every_option(capsys, command):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    options = [line for line in text.split("options:")[1].splitlines() if line.startswith("  --")]
+    assert all(len(line.split()) > 2 or text.splitlines()[text.splitlines().index(line) + 1].strip() for line in options)
+
+
+def test_check_says_what_is_in_a_scene(tmp_path, capsys):
+    assert main(["check", str(write_scene(tmp_path))]) == 0
+    text = capsys.readouterr().out
+    for word in ("good", "30 vertices", "40 triangles", "membrane, bending, collision, gravity, inertia (stvk)", "24 frames"):
+        assert word in text
+
+
+def test_check_warns_of_a_garment_inside_the_body(tmp_path, capsys):
+    scene = write_scene(tmp_path)
+    vertices, faces = grid(origin=(0.0, 0.3, 0.05))
+    np.savez(tmp_path / "cloth.npz", vertices=vertices, faces=faces)
+    assert main(["check", str(scene)]) == 0
+    assert "inside the body" in capsys.readouterr().out
+
+
+def test_train_says_where_it_is(run_folder, tmp_path, capsys):
+    scene, _ = run_folder
+    assert main(["train", str(scene), "--out", str(tmp_path / "run"), "--steps", "20", "--seed", "3"]) == 0
+    text = capsys.readouterr().out
+    for word in ("step 20/20", "membrane", "strain", "penetrating", "validation"):
+        assert word in text
+    facts = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert facts["steps"] == 20 and facts["seed"] == 3 and "jax" in facts["versions"]
+    assert any((tmp_path / "run" / "tensorboard").iterdir())
+    assert main(["train", str(scene), "--out", str(tmp_path / "run")]) == 2
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "frames"])
+def test_animate_in_every_format(run_folder, tmp_path, capsys, name):
+    _, folder = run_folder
+    assert main(["animate", str(folder), "--out", str(tmp_path / name), "--alpha", "1.5"]) == 0
+    assert "24 frames" in capsys.readouterr().out
+    assert (tmp_path / name).exists()
+    if name != "frames":
+        assert io.read_animation(tmp_path / name).vertices.shape == (24, 30, 3)
+    else:
+        assert len(list((tmp_path / name).glob("*.obj"))) == 24
+
+
+def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys):
+    scene, folder = run_folder
+    assert main(["evaluate", str(folder), "--json"]) == 0
+    (whole,) = json.loads(capsys.readouterr().out).values()
+    assert len(whole["frames"]["total"]) == 24 and {"strain_mean", "penetrating", "out_of_balance"} <= set(whole["mean"])
+    assert main(["animate", str(folder), "--out", str(tmp_path / "a.npz")]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "a.npz"), "--scene", str(scene), "--json"]) == 0
+    (again,) = json.loads(capsys.readouterr().out).values()
+    for name, value in whole["mean"].items():
+        assert again["mean"][name] == pytest.approx(value, rel=2e-3, abs=1e-3), name
+    assert main(["evaluate", str(folder)]) == 0
+    text = capsys.readouterr().out
+    assert "strain_mean [%]" in text and "out_of_balance [g]" in text
+    assert main(["evaluate", str(tmp_path / "a.npz")]) == 2
+    one_line(capsys, ["--scene"])
+
+
+def test_an_animation_of_another_motion_is_refused(run_folder, tmp_path, capsys):
+    scene, _ = run_folder
+    io.write_animation(tmp_path / "b.npz", np.zeros((7, 30, 3), np.float32), grid()[1], 30.0)
+    assert main(["evaluate", str(tmp_path / "b.npz"), "--scene", str(scene)]) == 2
+    one_line(capsys, ["b.npz", "vertices", "(7, 30, 3)", "--motion"])
+
+
+def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, monkeypatch):
+    _, folder = run_folder
+    np.savez(tmp_path / "other.npz", **swing(frames=9))
+    monkeypatch.chdir(tmp_path)
+    assert main(["animate", str(folder), "--motion", "other.npz", "--out", "c.npz"]) == 0
+    assert "9 frames" in capsys.readouterr().out
+    assert main(["animate", str(folder), "--motion", "nowhere.npz", "--out", "d.npz"]) == 2
+    one_line(capsys, ["nowhere.npz"])
+    assert main(["animate", str(folder), "--out", "d.gif"]) == 2
+    one_line(capsys, ["d.gif", ".npz"])
+
+
+@pytest.mark.parametrize("file", ["run.json", "prepared.npz"])
+def test_a_damaged_run_is_refused(run_folder, tmp_path, capsys, file):
+    copy = tmp_path / "run"
+    shutil.copytree(run_folder[1], copy)
+    truncated(copy / file)
+    assert main(["evaluate", str(copy)]) == 2
+    one_line(capsys, [file, "train again"])
+
+
+def test_a_damaged_checkpoint_is_refused(run_folder, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(run_folder[1], copy)
+    for path in (copy / "checkpoints" / "10").rglob("d/*"):
+        truncated(path)
+    done = process("evaluate", copy)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"ncs: {copy / 'checkpoints' / '10'}: the checkpoint cannot be read")
+    assert "ncs_jax" not in done.stderr, done.stderr
+
+
+def test_a_body_file_that_is_not_one(tmp_path, capsys):
+    scene = write_scene(tmp_path)
+    arrays = post()
+    del arrays["parents"]
+    np.savez(tmp_path / "body.npz", **arrays)
+    assert main(["check", str(scene)]) == 2
+    one_line(capsys, ["body.npz", "parents"])
