@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -40,6 +41,8 @@ def posed_body(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
 def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: str = "") -> dict[str, float]:
     """Write preview.png, preview.gif, preview.html and energies.png into a folder; return the motion's evaluation at alpha 1.
 
+    The curves need matplotlib, of the `plots` extra; without it they are left out.
+
     Args:
         run: trained. folder: where to. motion: a motion's name or file; else the scene's first validation or training motion.
     """
@@ -74,7 +77,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
         folder / "preview.html", animations, faces, body_vertices, body_faces, fps, title or "Neural cloth simulation", facts
     )
     log = folder / "log.csv"
-    if log.exists():
+    if log.exists() and find_spec("matplotlib"):
         with log.open(newline="") as file:
             pictures.energy_curves(folder / "energies.png", list(csv.DictReader(file)))
     return quantities

@@ -1,0 +1,1 @@
+"""Experiments: each is importable, takes a size, and writes a table and a picture."""

@@ -1,0 +1,35 @@
+"""Experiments and benchmarks at their smallest size."""
+
+import csv
+import json
+
+import pytest
+
+from benchmarks import training
+from experiments import seeds
+
+from .scenes import write_scene
+
+
+@pytest.fixture(autouse=True)
+def _plain(plain_jax):
+    yield
+
+
+def test_seeds(tmp_path, capsys):
+    scene, out = write_scene(tmp_path), tmp_path / "out"
+    assert seeds.main([str(scene), "--steps", "10", "--seeds", "2", "--out", str(out)]) == 0
+    with (out / "seeds.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["seed"] for row in rows] == ["0", "1"] and rows[0]["total"] != rows[1]["total"]
+    assert (out / "seeds.png").read_bytes()[:4] == b"\x89PNG"
+    assert "dropped 0" in capsys.readouterr().out
+    assert seeds.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+def test_training_benchmark(tmp_path, capsys):
+    assert training.main([str(write_scene(tmp_path)), "--repeats", "2", "--json", str(tmp_path / "t.json")]) == 0
+    result = json.loads((tmp_path / "t.json").read_text())
+    assert result["vertices"] == 30 and {"step", "gradient", "yardstick"} <= set(result["seconds"])
+    assert all(0 < t["min"] <= t["median"] <= t["max"] for t in result["seconds"].values())
+    assert "median" in capsys.readouterr().out
