@@ -1,9 +1,12 @@
 """Scene files: defaults, and one clear error for everything that can be wrong with one."""
 
+import dataclasses
+import tomllib
+
 import pytest
 
 from ncs_jax.errors import InputError
-from ncs_jax.scene import Scene, load_scene, scene_from
+from ncs_jax.scene import Scene, load_scene, scene_from, template
 
 
 def write(folder, text):
@@ -20,6 +23,18 @@ def test_a_scene_survives_its_own_tables(tmp_path):
     scene = load_scene(write(tmp_path, "[physics]\ngravity = [0, 0, -9.81]\n[network]\ndecoder = [64, 64]\n"))
     assert scene_from(scene.to_dict()).to_dict() == scene.to_dict()
     assert scene.physics.gravity == (0, 0, -9.81) and scene.network.decoder == (64, 64)
+
+
+def test_the_template_has_every_field_and_is_the_defaults(tmp_path):
+    text = template()
+    assert load_scene(write(tmp_path, text)).to_dict() == Scene().to_dict()
+    assert tomllib.loads(text) == {k: _lists(v) for k, v in dataclasses.asdict(Scene()).items() if k != "source"}
+
+
+def _lists(value):
+    if isinstance(value, dict):
+        return {k: _lists(v) for k, v in value.items()}
+    return list(value) if isinstance(value, tuple) else value
 
 
 def test_relative_paths_resolve_from_the_file(tmp_path):

@@ -78,7 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", action="store_true", help="print JSON, with every frame")
 
     check = command("check", _check, "read and assemble a scene without training it")
-    check.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME")
+    check.add_argument("scene", metavar="SCENE", nargs="?", help="scene file (TOML), or ncs:NAME")
+    check.add_argument("--fields", action="store_true", help="print a scene file with every field, its default and its range")
     return parser
 
 
@@ -261,8 +262,13 @@ def _evaluate(options) -> int:
 
 def _check(options) -> int:
     from ncs_jax.assembly import assemble
-    from ncs_jax.scene import load_scene
+    from ncs_jax.scene import load_scene, template
 
+    if options.fields:
+        print(template(), end="")
+        return 0
+    if options.scene is None:
+        raise InputError("a scene file is needed", mend="give one, ncs:tshirt for the packaged one, or --fields")
     assembly = assemble(load_scene(options.scene))
     model, mesh = assembly.model, assembly.model.garment.mesh
     names = assembly.body.joint_names if assembly.body is not None else ()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import tomllib
 import types
 import typing
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ __all__ = [
     "load_scene",
     "packaged",
     "scene_from",
+    "template",
 ]
 
 ASSETS = Path(__file__).parent / "assets"
@@ -222,6 +225,31 @@ def scene_from(tables: dict, source: str = "") -> Scene:
     if scene.garment.file in ("", "none"):
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
     return dataclasses.replace(scene, source=source)
+
+
+def template() -> str:
+    """A whole scene file: every field with its default, and in a comment what it is and what it may be."""
+    return "\n".join(_tables(Scene(), "")).strip() + "\n"
+
+
+def _tables(spec, where: str) -> Iterator[str]:
+    """The lines of a table's own fields, then of the tables in it."""
+    fields = [f for f in dataclasses.fields(spec) if not f.metadata.get("internal")]
+    nested = [f for f in fields if dataclasses.is_dataclass(getattr(spec, f.name))]
+    if where:
+        yield f"\n[{where}]"
+    for f in fields:
+        if f not in nested:
+            value, meta = getattr(spec, f.name), f.metadata
+            text = f"{f.name} = {json.dumps(value)}"
+            note = meta["help"]
+            if meta["choices"]:
+                note += ": " + ", ".join(meta["choices"])
+            elif math.isfinite(meta["low"]):
+                note += f"; {'above' if meta['above'] else 'from'} {meta['low']:.10g} to {meta['high']:.10g}"
+            yield f"{text:36} # {note}"
+    for f in nested:
+        yield from _tables(getattr(spec, f.name), f"{where}.{f.name}".lstrip("."))
 
 
 def _parse(cls, tables, source: str, where: str):
