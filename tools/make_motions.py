@@ -417,6 +417,11 @@ def _both(name: str, keys: Keys) -> dict[str, Keys]:
     return {f"{name}_left": keys, f"{name}_right": keys}
 
 
+def _raised(abduct: Keys) -> dict[str, Keys]:
+    """An arm turns outward as it is lifted: the shoulder would not let it pass otherwise."""
+    return _both("turn", [(at, -0.35 * angle) for at, angle in abduct])
+
+
 def plans() -> dict[str, Plan]:
     """All packaged motions."""
     out = {}
@@ -439,7 +444,7 @@ def plans() -> dict[str, Plan]:
         },
     )
     lift = [(0.4, 0), (1.6, 138), (2.1, 138), (3.2, 0), (3.6, 0), (4.4, 138), (4.7, 138), (5.6, 0)]
-    out["lift_arms"] = Plan(6.5, channels=_both("abduct", lift) | _both("turn", [(k, -0.35 * v) for k, v in lift]))
+    out["lift_arms"] = Plan(6.5, channels=_both("abduct", lift) | _raised(lift), waves={"twist": [(3.7, 5.6, 25, 1.1)]})
     out["dance"] = _dance()
     out["mixed"] = _mixed()
     return out
@@ -466,9 +471,8 @@ def _dance() -> Plan:
 
 def _mixed() -> Plan:
     steps, height, channels = jump(4.1, 0.2)
-    arms = channels | {
-        f"abduct_{key}": [*channels[f"abduct_{key}"], (6.1, 0), (6.9, 120), (7.1, 120), (7.9, 0)] for key in ("left", "right")
-    }
+    lift = [(6.1, 0), (6.9, 120), (7.1, 120), (7.9, 0)]
+    arms = channels | {f"abduct_{key}": [*channels[f"abduct_{key}"], *lift] for key in ("left", "right")} | _raised(lift)
     return Plan(
         8.0,
         walking(0.45, 7, 0.48) + steps,

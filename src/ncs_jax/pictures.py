@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from ncs_jax.errors import InputError
 from ncs_jax.rasteriser import PAPER, Camera, Ground, Mesh, render
 
-__all__ = ["VIEWS", "Camera", "Ground", "Mesh", "animation_gif", "contact_sheet", "energy_curves", "render", "upright"]
+__all__ = ["VIEWS", "animation_gif", "contact_sheet", "energy_curves", "upright"]
 
 _ROWS = ("front", "side")
 VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
