@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +20,7 @@ from ncs_jax.mesh import dihedral
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.numerics import angle_between, norm
-from ncs_jax.objective import Frame, energies
+from ncs_jax.objective import Frame, distances, energies
 
 __all__ = ["QUANTITIES", "measure", "summarise"]
 
@@ -33,7 +36,7 @@ QUANTITIES = {
 }
 
 
-def _frame(model: Model, x, previous, before, matrices) -> dict[str, Float[Array, ""]]:
+def _frame(model: Model, exact: bool, x, previous, before, matrices) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
     body = None if model.body is None else pose_body(model, matrices)
     blended = blend(matrices, model.blend) if terms.pinning else None
@@ -62,16 +65,19 @@ def _frame(model: Model, x, previous, before, matrices) -> dict[str, Float[Array
         "out_of_balance": jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81,
     }
     if model.surface is not None:
-        index, _ = nearest_triangle(x, body, model.surface)
-        depth = -triangle_distance(x, body, model.surface, index)
+        if exact:
+            index, _ = nearest_triangle(x, body, model.surface)
+            depth = -triangle_distance(x, body, model.surface, index)
+        else:
+            depth = -distances(x, body, model.surface, terms)
         result["penetrating"] = 100 * jnp.mean(depth > 0)
         result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
     return result
 
 
-@jax.jit
-def _measure(model, now, previous, before, matrices):
-    return lax.map(lambda frame: _frame(model, *frame), (now, previous, before, matrices))
+@functools.partial(jax.jit, static_argnums=1)
+def _measure(model, exact, now, previous, before, matrices):
+    return lax.map(lambda frame: _frame(model, exact, *frame), (now, previous, before, matrices))
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_balance": np.median}
@@ -79,22 +85,30 @@ _SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_
 BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
 
 
-def measure(model: Model, vertices: Float[Array | np.ndarray, "frames verts 3"], track: Track) -> dict[str, np.ndarray]:
+def measure(
+    model: Model, vertices: Float[Array | np.ndarray, "frames verts 3"], track: Track, *, exact: bool = True
+) -> dict[str, np.ndarray]:
     """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
 
     Args:
         vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
 
-    Energies use the scene's own terms; penetration uses the exact signed distance to the body's triangles. Before its first
-    frame the garment is taken to have been at rest.
+        exact: penetration by the exact signed distance to the body's triangles; else by the scene's own query, which is faster.
+
+    Energies use the scene's own terms. Before its first frame the garment is taken to have been at rest.
     """
     frames = len(vertices)
     positions = np.asarray(vertices)
-    blocks = []
-    for first in range(0, frames, BLOCK):
+
+    def block(first):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
         three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
-        blocks.append(jax.device_get(_measure(model, *three, track.matrices[t])))
+        return jax.device_get(_measure(model, exact, *three, track.matrices[t]))
+
+    first, *others = range(0, frames, BLOCK)
+    blocks = [block(first)]  # compiles
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps only one core busy
+        blocks += pool.map(block, others)
     return {name: np.concatenate([b[name] for b in blocks])[:frames] for name in blocks[0]}
 
 

@@ -1,0 +1,98 @@
+"""Evaluation: quantities of animations whose answers are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.assembly import assemble, track_of
+from ncs_jax.evaluation import BLOCK, measure, summarise
+from ncs_jax.scene import load_scene, scene_from
+
+from .scenes import write_scene
+
+
+def assembled(folder, **physics):
+    tables = load_scene(write_scene(folder)).to_dict()
+    tables["physics"].update(physics)
+    return assemble(scene_from(tables), dtype=jnp.float64)
+
+
+def still(model, frames=4):
+    """A track of the rest pose."""
+    from ncs_jax.io import MotionRecord
+
+    return track_of(model, MotionRecord(np.zeros((frames, 2, 3)), np.zeros((frames, 3)), model.fps, ()))
+
+
+@pytest.fixture
+def assembly(tmp_path):
+    return assembled(tmp_path)
+
+
+def test_the_rest_garment_has_no_strain(assembly):
+    model = assembly.model
+    x = np.repeat(np.asarray(model.garment.mesh.rest)[None], 4, axis=0)
+    rows = measure(model, x, still(model))
+    for name in ("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "membrane", "bending", "penetrating", "depth_max"):
+        np.testing.assert_allclose(rows[name], 0, atol=1e-8), name
+    np.testing.assert_allclose(rows["total"], sum(rows[n] for n in ("membrane", "bending", "collision", "gravity", "inertia")))
+    assert np.all(rows["out_of_balance"] > 0.99)  # nothing holds it up
+
+
+def test_a_stretch_is_its_strain_and_a_shear_its_angle(assembly):
+    model = assembly.model
+    rest = np.asarray(model.garment.mesh.rest)
+    x = rest[None] * np.array([1.1, 1.1, 1])
+    sheared = rest + 0.2 * rest[:, 1:2] * [1, 0, 0]
+    rows = measure(model, np.concatenate([x, x, sheared[None], sheared[None]]), still(model))
+    np.testing.assert_allclose(rows["strain_mean"][:2], 10, rtol=1e-9)
+    np.testing.assert_allclose(rows["strain_p99"][:2], 10, rtol=1e-9)
+    np.testing.assert_allclose(rows["shear_mean"][:2], 0, atol=1e-9)
+    np.testing.assert_allclose(rows["shear_mean"][2:], np.degrees(np.arctan(0.2)), rtol=1e-9)
+
+
+def test_depth_and_share_of_what_is_inside(assembly):
+    """A sheet 60 mm from the axis of a twelve-sided post whose corners are at 80 mm: its middle column of five is inside."""
+    model = assembly.model
+    rest = np.asarray(model.garment.mesh.rest)
+    x = np.stack([rest, rest - [0, 0, 0.03]])
+    rows = measure(model, x, still(model, 2))
+    np.testing.assert_allclose(rows["penetrating"], [0, 20], atol=1e-5)
+    assert rows["depth_max"][0] == 0
+    assert 80 * np.cos(np.pi / 12) - 60 <= rows["depth_max"][1] <= 20  # a side's middle, a corner
+    fast = measure(model, x, still(model, 2), exact=False)
+    # The next columns are half a millimetre outside a side, and inside the plane through its corner.
+    np.testing.assert_allclose(fast["penetrating"], [0, 60], atol=1e-5)
+
+
+def test_a_free_fall_is_in_balance(tmp_path):
+    model = assembled(tmp_path, collision={"stiffness": 0}).model
+    rest, dt = np.asarray(model.garment.mesh.rest), 1 / model.fps
+    n = np.arange(6)
+    x = rest + np.array([0, -9.81, 0]) * (dt**2 * n * (n + 1) / 2)[:, None, None]
+    rows = measure(model, x, still(model, 6))
+    assert "penetrating" not in rows
+    np.testing.assert_allclose(rows["out_of_balance"][1:], 0, atol=1e-6)
+    assert rows["out_of_balance"][0] == pytest.approx(1)
+
+
+def test_a_force_out_of_balance_is_in_multiples_of_g(tmp_path):
+    model = assembled(tmp_path, collision={"stiffness": 0}, gravity=[0, 0, 2.0]).model
+    x = np.repeat(np.asarray(model.garment.mesh.rest)[None], 3, axis=0)
+    np.testing.assert_allclose(measure(model, x, still(model, 3))["out_of_balance"], 2 / 9.81, rtol=1e-9)
+
+
+def test_frames_do_not_depend_on_how_many_there_are(assembly, rng):
+    model = assembly.model
+    x = np.asarray(model.garment.mesh.rest) + 0.002 * rng.normal(size=(BLOCK + 7, 30, 3))
+    whole, part = measure(model, x, still(model, BLOCK + 7)), measure(model, x[:9], still(model, 9))
+    for name, values in part.items():
+        np.testing.assert_allclose(whole[name][:9], values, rtol=1e-12, atol=1e-12)
+    assert all(len(values) == BLOCK + 7 for values in whole.values())
+
+
+def test_summary():
+    rows = {"total": np.array([1.0, 3.0]), "depth_max": np.array([1.0, 5.0]), "out_of_balance": np.array([1.0, 2.0, 90.0])}
+    assert summarise(rows) == {"total": 2.0, "depth_max": 5.0, "out_of_balance": 2.0}
+    assert isinstance(jax.tree.leaves(summarise(rows))[0], float)
