@@ -2,10 +2,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
 CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])').txt
+INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
+	$(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS))
 
 .PHONY: demo test test-all lint format assets clean
 
-demo: .venv/ready
+demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
 
 test: .venv/ready
@@ -31,9 +33,13 @@ assets: .venv/ready
 	$(BIN)/pip install -q embreex
 	$(BIN)/python tools/make_assets.py
 
-.venv/ready: pyproject.toml $(wildcard constraints/*.txt)
+.venv/installed: pyproject.toml $(wildcard constraints/*.txt)
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS)) --editable '.[dev]'
+	$(INSTALL) --editable '.[plots]'
+	touch $@
+
+.venv/ready: .venv/installed
+	$(INSTALL) --editable '.[dev]'
 	touch $@
 
 clean:
