@@ -1,0 +1,251 @@
+"""The page that plays an animation: what it stores, that it needs nothing else, and that a browser draws it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ncs_jax.errors import InputError
+from ncs_jax.viewer import write_page
+
+FRAMES = 24
+
+
+def tube(rings: int, around: int, radius: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder about Y, its faces outward."""
+    angle = 2 * np.pi * np.arange(around) / around
+    height = np.linspace(low, high, rings)
+    grid = np.stack(np.broadcast_arrays(radius * np.sin(angle), height[:, None], radius * np.cos(angle)), -1)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij"))
+    a, b = i * around + j, i * around + (j + 1) % around
+    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+    return grid.reshape(-1, 3), faces.astype(np.int32)
+
+
+@pytest.fixture
+def scene(rng) -> dict:
+    """A skirt about a post that walks 10 m; with alpha 1 it is half a metre to the left."""
+    body, body_faces = tube(8, 16, 0.12, 0.0, 1.7)
+    cloth, faces = tube(6, 24, 0.3, 0.6, 1.2)
+    walk = np.linspace(0, 1, FRAMES)[:, None, None] * np.array([6.0, 0.0, 8.0])
+    swing = 0.01 * rng.standard_normal((FRAMES, len(cloth), 3))
+    still = cloth + walk + swing
+    return {
+        "animations": {"0": still.astype(np.float32), "1": (still - [0.5, 0.0, 0.0]).astype(np.float32)},
+        "garment_faces": faces,
+        "body": (body + walk).astype(np.float32),
+        "body_faces": body_faces,
+        "fps": 30.0,
+        "title": "A skirt",
+        "facts": {"mean strain": "2.1 %"},
+    }
+
+
+class Page(HTMLParser):
+    """The page's elements by tag, its data blocks, and the rest of its text."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.blocks: dict[str, str] = {}
+        self.tags: list[tuple[str, dict]] = []
+        self.words = ""
+        self._block: str | None = None
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.scene = json.loads(self.blocks["scene"])
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._block = dict(attrs).get("id") if tag == "script" else None
+
+    def handle_endtag(self, tag):
+        self._block = None
+
+    def handle_data(self, data):
+        if self._block:
+            self.blocks[self._block] = self.blocks.get(self._block, "") + data
+        else:
+            self.words += data
+
+    def bytes(self, name: str) -> bytes:
+        return zlib.decompress(base64.b64decode(self.blocks[name]))
+
+    def faces(self, name: str) -> np.ndarray:
+        return np.frombuffer(self.bytes(name), "<i4").reshape(-1, 3)
+
+    def vertices(self, name: str, mesh: dict, track: dict) -> np.ndarray:
+        """What the script does, in NumPy: two running sums that wrap at 65536."""
+        raw, frames, verts = self.bytes(name), self.scene["frames"], mesh["verts"]
+        middle = np.frombuffer(raw, "<f4", 3 * frames).reshape(frames, 1, 3)
+        low, high = np.frombuffer(raw, np.uint8, offset=12 * frames).reshape(2, frames, 3, verts).astype(np.uint16)
+        grid = low | high << 8
+        for _ in range(2):
+            grid = np.cumsum(grid, 0, dtype=np.uint16)
+        return middle + np.array(track["low"]) + track["step"] * grid.transpose(0, 2, 1)
+
+
+def written(tmp_path: Path, scene: dict, **changes) -> Page:
+    path = tmp_path / "preview.html"
+    write_page(path, **{**scene, **changes})
+    return Page(path)
+
+
+def test_positions_survive(tmp_path, scene):
+    page = written(tmp_path, scene)
+    assert page.scene["labels"] == ["0", "1"] and page.scene["frames"] == FRAMES and page.scene["fps"] == 30.0
+    for i, x in enumerate(scene["animations"].values()):
+        stored = page.vertices(f"track-{i}", page.scene["garment"], page.scene["garment"]["tracks"][i])
+        np.testing.assert_allclose(stored, x, rtol=0, atol=3e-5)
+    assert np.abs(scene["body"]).max() > 7.5
+    stored = page.vertices("track-body", page.scene["body"], page.scene["body"]["tracks"][0])
+    np.testing.assert_allclose(stored, scene["body"], rtol=0, atol=3e-5)
+    np.testing.assert_array_equal(page.faces("garment-faces"), scene["garment_faces"])
+    np.testing.assert_array_equal(page.faces("body-faces"), scene["body_faces"])
+
+
+def test_a_wide_frame_uses_the_whole_grid(tmp_path, scene):
+    wide = scene["animations"]["0"].copy()
+    wide[5, 7] += 100.0
+    page = written(tmp_path, scene, animations={"0": wide})
+    track = page.scene["garment"]["tracks"][0]
+    np.testing.assert_allclose(page.vertices("track-0", page.scene["garment"], track), wide, rtol=0, atol=0.51 * track["step"])
+    assert track["step"] < 0.002
+
+
+def test_a_smooth_motion_is_small(tmp_path):
+    cloth, faces = tube(32, 32, 0.3, 0.6, 1.2)
+    t = np.arange(240)[:, None, None] / 30
+    moving = (cloth + 0.2 * np.sin(t + cloth[:, 1:2]) * [1.0, 0.2, 0.5]).astype(np.float32)
+    written(tmp_path, {}, animations={"0": moving}, garment_faces=faces, body=None, body_faces=None, fps=30, title="", facts={})
+    assert (tmp_path / "preview.html").stat().st_size < 0.5 * moving.nbytes
+
+
+def test_nothing_is_loaded(tmp_path, scene):
+    page = written(tmp_path, scene)
+    rest = page.source.replace("http-equiv", "")
+    for name, text in page.blocks.items():
+        if name != "scene":
+            assert re.fullmatch("[A-Za-z0-9+/]+=*", text)
+            rest = rest.replace(text, "")
+    for word in ("http", "//www", "src=", "@import", "url(", "fetch(", "import(", "XMLHttpRequest", "<link", "<iframe"):
+        assert word not in rest, word
+    policy = [a["content"] for tag, a in page.tags if a.get("http-equiv") == "Content-Security-Policy"]
+    assert len(policy) == 1
+    assert "default-src 'none'" in policy[0] and "script-src 'unsafe-inline'" in policy[0]
+    assert "connect-src" not in policy[0]
+    assert "{{" not in rest.replace("${{", "")
+
+
+def test_words_are_escaped(tmp_path, scene):
+    title, fact = '</title><script>alert("1")</script>', {"<b>key</b>": "<img onerror='x'> & {{DATA}}", "b": "{{TITLE}}"}
+    label = "</script><i>"
+    page = written(tmp_path, scene, title=title, facts=fact, animations={label: scene["animations"]["0"]})
+    assert "<script>alert" not in page.source and "<img" not in page.source and "<b>" not in page.source
+    assert "</script><i>" not in page.source and page.scene["labels"] == [label]
+    for words in (title, *fact, *fact.values()):
+        assert words in page.words
+
+
+def test_controls_have_names(tmp_path, scene):
+    page = written(tmp_path, scene)
+    named = {a["aria-label"] for tag, a in page.tags if tag in ("button", "input", "select") and "aria-label" in a}
+    assert {"Play", "Previous frame", "Next frame", "Frame", "Speed", "Wireframe", "Reset view"} <= named
+    assert page.source.startswith("<!doctype html>") and ("html", {"lang": "en"}) in page.tags
+
+
+def test_one_animation_and_no_body(tmp_path, scene):
+    page = written(tmp_path, scene, animations={"0": scene["animations"]["0"]}, body=None, body_faces=None, facts={})
+    assert page.scene["labels"] == ["0"] and "body" not in page.scene and "track-body" not in page.blocks
+
+
+def _with(x, value):
+    x = x.copy()
+    x[3, 2, 1] = value
+    return x
+
+
+BAD = {
+    "nan": (lambda s: {"animations": {**s["animations"], "1": _with(s["animations"]["1"], np.nan)}}, "animations['1']"),
+    "infinite": (lambda s: {"animations": {**s["animations"], "1": _with(s["animations"]["1"], np.inf)}}, "animations['1']"),
+    "huge": (lambda s: {"animations": {**s["animations"], "1": _with(s["animations"]["1"], 1e9)}}, "animations['1']"),
+    "body nan": (lambda s: {"body": _with(s["body"], np.nan)}, "body"),
+    "frames": (lambda s: {"animations": {**s["animations"], "1": s["animations"]["1"][:-1]}}, "animations['1']"),
+    "verts": (lambda s: {"animations": {**s["animations"], "1": s["animations"]["1"][:, :-1]}}, "animations['1']"),
+    "body frames": (lambda s: {"body": s["body"][:-1]}, "body"),
+    "flat": (lambda s: {"animations": {"0": s["animations"]["0"][0]}}, "animations['0']"),
+    "empty": (lambda s: {"animations": {"0": s["animations"]["0"][:0]}}, "animations['0']"),
+    "none": (lambda s: {"animations": {}}, "animations"),
+    "faces": (lambda s: {"garment_faces": s["garment_faces"] + 1}, "garment_faces"),
+    "quads": (lambda s: {"garment_faces": np.zeros((3, 4), int)}, "garment_faces"),
+    "body faces": (lambda s: {"body_faces": None}, "body_faces"),
+    "fps": (lambda s: {"fps": 0.0}, "fps"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_shown_is_named(tmp_path, scene, name):
+    change, field = BAD[name]
+    with pytest.raises(InputError) as caught:
+        written(tmp_path, scene, **change(scene))
+    assert caught.value.field == field
+    assert not (tmp_path / "preview.html").exists()
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+
+
+def screenshot(tmp_path: Path, page: Path, view: str) -> np.ndarray:
+    picture = tmp_path / "view.png"
+    picture.unlink(missing_ok=True)
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+    command += ["--enable-unsafe-swiftshader", "--hide-scrollbars", "--force-device-scale-factor=1", "--window-size=640,480"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0", "--virtual-time-budget=4000"]
+    done = subprocess.run([*command, f"--screenshot={picture}", f"{page.as_uri()}#{view}"], capture_output=True, timeout=120)
+    complaints = [line for line in done.stderr.decode(errors="replace").splitlines() if "CONSOLE" in line]
+    assert not complaints and picture.exists()
+    return np.asarray(Image.open(picture).convert("RGB")).astype(int)
+
+
+def cloth_coloured(image: np.ndarray) -> np.ndarray:
+    """Where the picture is as orange as the garment, above the controls."""
+    r, g, b = np.moveaxis(image[:360], 2, 0)
+    return (r > 120) & (r > 1.4 * g) & (g > b)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_browser_draws_it(tmp_path, scene):
+    written(tmp_path, scene, facts={})
+    page = tmp_path / "preview.html"
+    seen = {alpha: screenshot(tmp_path, page, f"frame=6&azimuth=0&paused&alpha={alpha}") for alpha in "01"}
+    masks = {alpha: cloth_coloured(image) for alpha, image in seen.items()}
+    columns = {}
+    for alpha, mask in masks.items():
+        assert mask.sum() > 1500, alpha
+        rows, across = np.nonzero(mask)
+        columns[alpha] = across.mean()
+        (top, bottom), (left, right) = np.quantile(rows, [0.005, 0.995]), np.quantile(across, [0.005, 0.995])
+        assert 0.9 < (bottom - top) / (right - left) < 1.2, alpha  # a skirt 0.6 m high and 0.6 m wide, and whole
+        assert mask.sum() > 0.85 * (bottom - top) * (right - left), alpha
+    assert columns["1"] < columns["0"] - 20  # half a metre to the left, under a camera that stays
+    assert np.abs(seen["0"] - seen["1"]).max(2).mean() > 1
+    assert np.abs(seen["0"][5, 320] - (247, 245, 241)).max() <= 1
+    bare = screenshot(tmp_path, page, "frame=6&azimuth=0&paused&alpha=0&body=0")
+    assert cloth_coloured(bare).sum() > 1500 and np.abs(bare - seen["0"]).max() > 60
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_browser_draws_a_garment_alone(tmp_path, scene):
+    written(tmp_path, scene, animations={"0": scene["animations"]["0"]}, body=None, body_faces=None)
+    assert cloth_coloured(screenshot(tmp_path, tmp_path / "preview.html", "paused&frame=23")).sum() > 1500
