@@ -1,0 +1,186 @@
+"""What is found out once about a garment on a character: weights, joints that matter, and what it can touch."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ncs_jax.assembly import assemble
+from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.mesh import topology
+from ncs_jax.model import local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
+from ncs_jax.rotations import axis_angle_to_matrix
+from ncs_jax.scene import load_scene
+
+from .scenes import post, write_scene
+from .shapes import ball, rotation, sheet
+
+# --- weights ------------------------------------------------------------------------------------------------------------
+
+
+def test_weights_at_a_point_of_a_face_are_interpolated(rng):
+    """Points a little outside a ball's faces, straight above known barycentric coordinates; corners and edges too."""
+    vertices, faces = ball(1)
+    weights = rng.dirichlet(np.ones(4), len(vertices))
+    inside = rng.dirichlet(np.ones(3) * 2, 20)
+    edge = np.concatenate([rng.dirichlet(np.ones(2), 10), np.zeros((10, 1))], axis=1)
+    barycentric = np.concatenate([inside, edge, np.eye(3)])
+    face = faces[rng.integers(len(faces), size=len(barycentric))]
+    corners = vertices[face]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    points = np.einsum("vk,vkd->vd", barycentric, corners) + 0.004 * normal
+    right = np.einsum("vk,vkj->vj", barycentric, weights[face])
+    found = transfer_weights(points, vertices, faces, weights)
+    np.testing.assert_allclose(found, right, atol=2e-5)  # searched in single precision
+    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-6)
+    # the nearest vertex alone is another answer
+    nearest = weights[np.linalg.norm(points[:, None] - vertices[None], axis=-1).argmin(axis=1)]
+    assert np.abs(nearest - right)[:20].max() > 0.1
+
+
+def test_a_body_vertex_between_faces_gives_its_own_weights():
+    body = post()
+    weights = body["blend_weights"]
+    found = transfer_weights(body["vertices"], body["vertices"], body["faces"], weights)
+    np.testing.assert_allclose(found, weights, atol=1e-5)
+
+
+def test_smoothing_is_the_mean_of_the_neighbours_again_and_again(rng):
+    vertices, faces = sheet(5, 6, 0.01)
+    edges = topology(faces)[0]
+    weights = rng.dirichlet(np.ones(3), len(vertices))
+    neighbours = [[*edges[edges[:, 0] == v, 1], *edges[edges[:, 1] == v, 0]] for v in range(len(vertices))]
+    right = weights
+    for _ in range(4):
+        right = np.stack([right[n].mean(axis=0) for n in neighbours])
+    np.testing.assert_allclose(smooth_weights(weights, edges, 4), right, atol=1e-14)
+    np.testing.assert_allclose(smooth_weights(weights, edges, 0), weights, atol=1e-15)
+
+
+@pytest.mark.parametrize("times", [0, 1, 10, 200])
+def test_smoothed_weights_are_weights(rng, times):
+    vertices, faces = sheet(5, 6, 0.01)
+    edges = topology(faces)[0]
+    weights = rng.dirichlet(0.2 * np.ones(5), len(vertices) + 1)  # the last vertex belongs to no edge
+    kept = weights.copy()
+    smoothed = smooth_weights(weights, edges, times)
+    np.testing.assert_allclose(smoothed.sum(axis=1), 1, rtol=1e-13)
+    assert (smoothed >= 0).all()
+    np.testing.assert_allclose(smoothed[-1], weights[-1], rtol=1e-12)
+    np.testing.assert_array_equal(weights, kept)
+    spread = lambda w: np.ptp(w[:-1], axis=0).max()  # noqa: E731
+    assert spread(smoothed) <= spread(weights) * (0.7 if times else 1 + 1e-12)
+    np.testing.assert_allclose(smooth_weights(np.full((31, 2), 0.5), edges, times), 0.5, rtol=1e-13)
+
+
+# --- joints -------------------------------------------------------------------------------------------------------------
+
+PARENTS = (-1, 0, 1, 2, 0, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("heavy", "used"),
+    [([3], (0, 1, 2, 3)), ([5], (0, 4, 5)), ([2, 6], (0, 1, 2, 4, 5, 6)), ([0], (0,)), ([], (0,))],
+)
+def test_joints_that_matter_and_all_their_ancestors(heavy, used):
+    weights = np.full((10, 7), 1e-3)
+    weights[4, heavy] = 0.3
+    assert used_joints(PARENTS, weights) == used
+    assert used_joints(PARENTS, weights, least=1e-4) == tuple(range(7))
+    weights[4, heavy] = 0.01  # just enough
+    assert used_joints(PARENTS, weights) == used
+    assert used_joints(PARENTS, np.zeros((0, 7))) == (0,)
+
+
+def test_joints_left_out_change_nothing(tmp_path, rng):
+    """A body with more joints than the garment needs: the model's small skeleton poses the garment as the whole would."""
+    path = write_scene(tmp_path)
+    body = post()
+    more = dict(body)
+    more["joints"] = np.concatenate([body["joints"], [[0, 0.9, 0], [0.3, 0.1, 0]]])
+    more["parents"] = np.array([-1, 0, 1, 0])
+    more["blend_weights"] = np.pad(body["blend_weights"], ((0, 0), (0, 2)))
+    np.savez(tmp_path / "body.npz", **more)
+    poses, translation = 0.3 * rng.normal(size=(5, 4, 3)), rng.normal(size=(5, 3))
+    np.savez(tmp_path / "swing.npz", poses=poses, trans=0.1 * translation, fps=np.array(30.0))
+    model = assemble(load_scene(path), dtype=jnp.float64).model
+    assert model.source_joints == (0, 1) and len(model.skeleton.parents) == 2
+    local = local_rotations(model, jnp.asarray(poses))
+    np.testing.assert_allclose(local, axis_angle_to_matrix(jnp.asarray(poses[:, :2])), atol=1e-15)
+
+    small = transforms(model.skeleton, forward(model.skeleton, local, jnp.asarray(translation)))
+    whole = Skeleton(jnp.asarray(more["joints"]), tuple(int(p) for p in more["parents"]))
+    every = axis_angle_to_matrix(jnp.asarray(poses))
+    full = transforms(whole, forward(whole, every, jnp.asarray(translation)))
+    np.testing.assert_allclose(blend(small, model.blend), blend(full, model.blend), atol=1e-13)
+    assert np.abs(np.asarray(full[:, 2:])).max() > 0.1
+
+
+def test_rest_axes_are_turned_once(tmp_path, rng):
+    model = assemble(load_scene(write_scene(tmp_path)), dtype=jnp.float64).model
+    q = jnp.asarray(Rotation.from_rotvec(rng.normal(size=(2, 3))).as_matrix())
+    poses = jnp.asarray(rng.normal(size=(3, 2, 3)))
+    turned = local_rotations(dataclasses.replace(model, rest_rotations=q), poses)
+    np.testing.assert_allclose(turned, to_rest_axes(local_rotations(model, poses), q), atol=1e-14)
+    assert np.abs(np.asarray(turned - local_rotations(model, poses))).max() > 0.1
+
+
+# --- touch --------------------------------------------------------------------------------------------------------------
+
+
+def posed_by_loop(vertices, weights, joints, parents, local):
+    world, position = np.zeros_like(local), np.zeros((len(joints), 3))
+    for j, parent in enumerate(parents):
+        world[j] = local[j] if parent < 0 else world[parent] @ local[j]
+        position[j] = joints[j] if parent < 0 else position[parent] + world[parent] @ (joints[j] - joints[parent])
+    return sum(weights[:, j, None] * ((vertices - joints[j]) @ world[j].T + position[j]) for j in range(len(joints)))
+
+
+@pytest.mark.parametrize("reach", [0.01, 0.035, 0.08])
+def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
+    """An arm folds onto a sheet on the trunk: at rest it is far away."""
+    body = post()
+    cloth, _ = sheet(4, 5, 0.02)
+    cloth = cloth + [-0.04, 0.2, 0.11]
+    cloth_weights = np.tile([1.0, 0.0], (len(cloth), 1))
+    joints, parents = body["joints"], [-1, 0]
+    skeleton = Skeleton(jnp.asarray(joints), (-1, 0))
+    bent = [np.stack([rotation([1, 2, 3], 0.7), rotation([1, 0, 0], a)]) for a in (2.9, 1.2)]
+
+    right = np.zeros(len(body["vertices"]), bool)
+    by_pose = []
+    for local in [np.stack([np.eye(3)] * 2), *bent]:
+        x = posed_by_loop(cloth, cloth_weights, joints, parents, local)
+        b = posed_by_loop(body["vertices"], body["blend_weights"], joints, parents, local)
+        distance = np.linalg.norm(x[:, None] - b[None], axis=-1).min(axis=0)
+        assert np.abs(distance - reach).min() > 1e-9  # no tie
+        by_pose.append(distance <= reach)
+        right |= distance <= reach
+    blends = blend_from(cloth_weights, dtype=jnp.float64), blend_from(body["blend_weights"], dtype=jnp.float64)
+    found = touchable(skeleton, cloth, blends[0], body["vertices"], blends[1], bent, reach)
+    np.testing.assert_array_equal(found, right)
+    assert not found.all()
+    if reach > 0.03:
+        assert by_pose[0].any()
+    if reach > 0.05:
+        assert (by_pose[1] & ~by_pose[0] & ~by_pose[2]).any()  # the folded arm is what the poses are looked at for
+    at_rest = touchable(skeleton, cloth, blends[0], body["vertices"], blends[1], [], reach)
+    np.testing.assert_array_equal(at_rest, by_pose[0])
+
+
+def test_the_body_that_can_be_touched_is_posed_like_the_whole(tmp_path, rng):
+    assembly = assemble(load_scene(write_scene(tmp_path)), dtype=jnp.float64)
+    model, body = assembly.model, assembly.body
+    assert 0 < len(model.body) < len(body.vertices)
+    local = Rotation.from_rotvec(0.5 * rng.normal(size=(2, 3))).as_matrix()
+    m = transforms(model.skeleton, forward(model.skeleton, jnp.asarray(local), jnp.zeros(3)))
+    whole = posed_by_loop(np.asarray(body.vertices, np.float64), body.weights, body.joints, [-1, 0], local)
+    np.testing.assert_allclose(jax.jit(pose_body)(model, m), whole[assembly.prepared.part], atol=1e-6)  # weights are float32
+    everywhere = skin(blend(m, blend_from(body.weights, dtype=jnp.float64)), jnp.asarray(body.vertices, jnp.float64))
+    np.testing.assert_allclose(everywhere, whole, atol=1e-6)

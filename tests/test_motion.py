@@ -1,0 +1,172 @@
+"""Motions looked up frame by frame: laid end to end, and in a mirror."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ncs_jax.assembly import assemble, track_of
+from ncs_jax.io import MotionRecord
+from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, transforms
+from ncs_jax.motion import input_joints, mirror, track
+from ncs_jax.rotations import axis_angle_to_matrix
+from ncs_jax.scene import load_scene
+
+from .scenes import write_scene
+
+# hips, left leg, right leg, spine, left arm, right arm, left hand, right hand
+PARENTS = (-1, 0, 0, 0, 3, 3, 4, 5)
+PARTNER = np.array([0, 2, 1, 3, 5, 4, 7, 6])
+RIGHT = np.array([[0, 0.9, 0.02], [-0.1, 0.8, 0], [0, 1.3, -0.03], [-0.2, 1.4, 0], [-0.7, 1.3, 0.1]])
+JOINTS = np.stack([RIGHT[0], RIGHT[1] * [-1, 1, 1], RIGHT[1], RIGHT[2], RIGHT[3] * [-1, 1, 1], RIGHT[3],
+                   RIGHT[4] * [-1, 1, 1], RIGHT[4]])  # fmt: skip
+run = jax.jit(forward)
+
+
+def recorded(rng, frames=6, joints=8):
+    return 0.8 * rng.normal(size=(frames, joints, 3)), rng.normal(size=(frames, 3))
+
+
+def posed(poses, translation, joints=JOINTS):
+    local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    return run(Skeleton(jnp.asarray(joints), PARENTS), jnp.asarray(local), jnp.asarray(translation))
+
+
+# --- mirror -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_two_mirrors_show_the_motion_itself(rng, axis):
+    poses, translation = recorded(rng)
+    kept = poses.copy(), translation.copy()
+    once = mirror(poses, translation, PARTNER, axis)
+    assert np.abs(once[0] - poses).max() > 0.1 and np.abs(once[1] - translation).max() > 0.1
+    twice = mirror(*once, PARTNER, axis)
+    np.testing.assert_array_equal(twice[0], poses)
+    np.testing.assert_array_equal(twice[1], translation)
+    # the given motion is left as it is, and what is returned shares nothing with it
+    once[0][:], once[1][:] = 0, 0
+    np.testing.assert_array_equal(poses, kept[0])
+    np.testing.assert_array_equal(translation, kept[1])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mirrored_motion_is_the_mirror_image(rng, axis):
+    """Of every joint's place, and of every joint's turning: R becomes S R S on the other side."""
+    joints = np.roll(JOINTS, axis, axis=1)  # left and right along that axis
+    poses, translation = recorded(rng)
+    here, there = posed(poses, translation, joints), posed(*mirror(poses, translation, PARTNER, axis), joints)
+    reflect = np.ones(3)
+    reflect[axis] = -1
+    np.testing.assert_allclose(there.positions, np.asarray(here.positions)[:, PARTNER] * reflect, atol=1e-13)
+    turned = np.asarray(here.rotations)[:, PARTNER] * reflect[:, None] * reflect
+    np.testing.assert_allclose(there.rotations, turned, atol=1e-13)
+    assert np.abs(np.asarray(there.positions) - np.asarray(here.positions)).max() > 0.1
+
+
+def test_the_mirrored_character_wears_its_skin_mirrored(rng):
+    """Skinned points too, whose weights are each other's image."""
+    x = rng.normal(size=(20, 3))
+    weights = rng.dirichlet(np.ones(8), 20)
+    poses, translation = recorded(rng, frames=1)
+    s = Skeleton(jnp.asarray(JOINTS), PARENTS)
+    here, there = posed(poses, translation), posed(*mirror(poses, translation, PARTNER))
+
+    def skinned(pose, x, weights):
+        m = transforms(s, jax.tree.map(lambda a: a[0], pose))
+        return np.asarray(skin(blend(m, blend_from(weights, dtype=jnp.float64)), jnp.asarray(x)))
+
+    image = skinned(there, x * [-1, 1, 1], weights[:, PARTNER])
+    np.testing.assert_allclose(image, skinned(here, x, weights) * [-1, 1, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_mirror_keeps_the_type(rng, dtype):
+    poses, translation = (a.astype(dtype) for a in recorded(rng))
+    result = mirror(poses, translation, PARTNER)
+    assert result[0].dtype == result[1].dtype == dtype
+
+
+# --- track --------------------------------------------------------------------------------------------------------------
+
+
+def ready(folder):
+    return assemble(load_scene(write_scene(folder)), dtype=jnp.float64).model
+
+
+def wander(rng, frames):
+    t = np.arange(frames)[:, None, None] / 30
+    poses = rng.normal(size=(1, 2, 3)) * np.sin(4 * t + rng.normal(size=(1, 2, 3)))
+    return MotionRecord(poses, np.cumsum(0.03 * rng.normal(size=(frames, 3)), axis=0), 30.0, ())
+
+
+def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng):
+    model = ready(tmp_path)
+    records = [wander(rng, n) for n in (6, 6)]
+    together, alone = track_of(model, *records), [track_of(model, r) for r in records]
+    np.testing.assert_array_equal(together.start, np.repeat([0, 6], 6))
+    assert together.start.dtype == jnp.int32
+    for name in ("static", "dynamic", "matrices"):
+        parts = np.concatenate([getattr(a, name) for a in alone])
+        np.testing.assert_allclose(getattr(together, name), parts, rtol=0, atol=1e-12)
+    # though the second begins far from where the first ended, nothing is seen of the jump
+    for first in (0, 6):
+        np.testing.assert_array_equal(together.dynamic[first], 0)
+    assert np.abs(np.asarray(together.dynamic[1:6])).max(axis=(1, 2)).min() > 1e-3
+    as_one = track_of(model, MotionRecord(*(np.concatenate([getattr(r, n) for r in records]) for n in ("poses", "translation")),
+                                          30.0, ()))  # fmt: skip
+    assert np.abs(np.asarray(as_one.dynamic - together.dynamic))[6].max() > 1e-2
+
+
+def test_a_character_stood_still_before_its_first_frame(tmp_path, rng):
+    model = ready(tmp_path)
+    record = wander(rng, 6)
+    rested = MotionRecord(
+        np.concatenate([np.repeat(record.poses[:1], 6, axis=0), record.poses]),
+        np.concatenate([np.repeat(record.translation[:1], 6, axis=0), record.translation]), 30.0, (),
+    )  # fmt: skip
+    plain, after = track_of(model, record), track_of(model, rested)
+    np.testing.assert_allclose(after.dynamic[6:], plain.dynamic, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(after.dynamic[:6], 0)
+
+
+def test_a_frame_is_described_by_itself_and_the_two_before(tmp_path, rng):
+    model = ready(tmp_path)
+    record = wander(rng, 12)
+    whole = track_of(model, record)
+    piece = track_of(model, MotionRecord(record.poses[4:10], record.translation[4:10], 30.0, ()))
+    np.testing.assert_allclose(piece.static, whole.static[4:10], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(piece.matrices, whole.matrices[4:10], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(piece.dynamic[2:], whole.dynamic[6:10], rtol=0, atol=1e-12)
+    assert np.abs(np.asarray(piece.dynamic[1] - whole.dynamic[5])).max() > 1e-3  # of the acceleration it knows too little
+
+
+def test_matrices_carry_rest_points_to_the_pose(tmp_path, rng):
+    model = ready(tmp_path)
+    record = wander(rng, 6)
+    matrices = np.asarray(track_of(model, record).matrices)
+    local = axis_angle_to_matrix(jnp.asarray(record.poses))
+    pose = forward(model.skeleton, local, jnp.asarray(record.translation))
+    joints = np.asarray(model.skeleton.joints)
+    carried = np.einsum("fjab,jb->fja", matrices[..., :3], joints) + matrices[..., 3]
+    np.testing.assert_allclose(carried, pose.positions, atol=1e-13)
+    np.testing.assert_allclose(matrices[..., :3], pose.rotations, atol=1e-14)
+
+
+@pytest.mark.parametrize("inputs", [(0,), (1, 0)])
+def test_the_network_reads_its_input_joints_in_order(tmp_path, rng, inputs):
+    model = dataclasses.replace(ready(tmp_path), inputs=inputs)
+    record = wander(rng, 3)
+    local = axis_angle_to_matrix(jnp.asarray(record.poses))
+    pose = forward(model.skeleton, local, jnp.asarray(record.translation))
+    one = jax.tree.map(lambda a: a[2], pose)
+    joints = input_joints(model, local[2], one)
+    for name, source in (("local", local[2]), ("world", one.rotations), ("positions", one.positions)):
+        np.testing.assert_array_equal(getattr(joints, name), np.asarray(source)[list(inputs)])
+    start = jnp.zeros(3, jnp.int32)
+    assert track(model, local, jnp.asarray(record.translation), start).static.shape == (3, len(inputs), 9)
