@@ -228,6 +228,7 @@ def test_half_a_garment_that_is_nan_and_no_body(tmp_path, swing):
     pictures.contact_sheet(tmp_path / "a.png", garment, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
     pictures.animation_gif(tmp_path / "a.gif", garment, swing["garment_faces"], None, None, 15.0, max_frames=3, size=(40, 50))
     pictures.contact_sheet(tmp_path / "b.png", garment * np.nan, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
+    assert all((tmp_path / name).stat().st_size > 100 for name in ("a.png", "a.gif", "b.png"))
 
 
 @pytest.mark.parametrize(

@@ -133,13 +133,16 @@ class Checkpoints:
         """
         shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), like)
         step = self.latest()
+        # Where one array is damaged, the others, still being read, complain one by one that nobody waits for them.
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
         try:
-            return self._manager.restore(step, args=self._args.StandardRestore(shapes))
+            state = self._manager.restore(step, args=self._args.StandardRestore(shapes))
         except Exception as error:  # Orbax and its store have no common error class
-            sys.unraisablehook = lambda _: None  # the arrays still being read complain one by one that nobody waits for them
             reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
             mend = "delete this folder to go back to the checkpoint before it"
             raise InputError(f"the checkpoint cannot be read: {reason}", file=self._folder / str(step), mend=mend) from error
+        sys.unraisablehook = hook
+        return state
 
     def close(self) -> None:
         """Wait for pending writes."""
