@@ -14,10 +14,10 @@ test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2 -m "not slow and not gpu"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow and not gpu"
 
 test-all: .venv/ready
-	$(BIN)/pytest -n 2 -m "not gpu"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not gpu"
 
 lint: .venv/ready
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from ncs_jax.energies.collision import (
     nearest_triangle,
     nearest_vertex,
     plane_distance,
+    smooth_distance,
     surface_from,
     triangle_distance,
     vertex_normals,
@@ -264,6 +266,156 @@ def test_vertex_normals_and_plane_distance_on_a_ball():
     for offset in (0.01, -0.01):
         x = jnp.asarray(vertices) + offset * normals
         np.testing.assert_allclose(plane_distance(x, jnp.asarray(vertices), normals, index), offset, rtol=1e-9)
+
+
+# --- smooth distance --------------------------------------------------------------------------------------------------
+
+
+def packaged(name):
+    """Vertices and faces of what comes with the package."""
+    import ncs_jax
+
+    with np.load(Path(ncs_jax.__file__).parent / "assets" / f"{name}.npz", allow_pickle=False) as file:
+        return file["vertices"].astype(np.float64), file["faces"]
+
+
+@cache
+def smooth():
+    def value(x, body, surface):
+        return smooth_distance(x, body, vertex_normals(body, surface), surface)
+
+    def whole(x, body, surface):
+        d, pull = jax.vjp(lambda x, body: value(x, body, surface), x, body)
+        return d, *pull(jnp.ones_like(d))
+
+    return jax.jit(whole)
+
+
+def mean_edge(vertices, faces):
+    edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean()
+
+
+def normals_of(vertices, faces):
+    p = vertices[faces]
+    area = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    total = np.zeros_like(vertices)
+    np.add.at(total, faces.reshape(-1), np.repeat(area, 3, axis=0))
+    return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def blended_planes(x, vertices, faces):
+    """The formula over all the vertices of the body."""
+    h, normals = mean_edge(vertices, faces), normals_of(vertices, faces)
+    d = []
+    for point in x:
+        gap = point - vertices
+        square = np.sum(gap**2, axis=1)
+        weight = np.exp((square.min() - square) / h**2)
+        d.append(np.sum(weight * np.sum(gap * normals, axis=1)) / weight.sum())
+    return np.array(d)
+
+
+@cache
+def near_skin(name):
+    """A body and cloth that lies together as cloth does, within 2 h of its vertices, outside and inside."""
+    rng = np.random.default_rng(9)
+    if name == "ball":
+        vertices, faces = ball(3)
+        cloth = rng.normal(size=(2000, 3))
+        cloth *= 0.1 / np.linalg.norm(cloth, axis=1, keepdims=True)
+    else:
+        vertices, faces = packaged("body")
+        cloth = packaged("tshirt")[0]
+    h = mean_edge(vertices, faces)
+    nearest = np.linalg.norm(cloth[:, None] - vertices[None], axis=-1).argmin(axis=1)
+    height = h * rng.uniform(-1.5, 1.9, (len(cloth), 1))
+    x = vertices[nearest] + height * normals_of(vertices, faces)[nearest]
+    return np.where(rng.random((len(x), 1)) < 0.8, x, vertices[nearest] + 0.5 * h * rng.normal(size=x.shape)), vertices, faces
+
+
+@pytest.mark.parametrize("name", ["ball", "body"])
+def test_smooth_distance_is_the_formula_over_all_vertices(name):
+    x, vertices, faces = near_skin(name)
+    h, right = mean_edge(vertices, faces), blended_planes(x, vertices, faces)
+    assert (right < -0.5 * h).sum() > 50 and (right > 0.5 * h).sum() > 50
+    for groups in (12, 24):
+        surface = surface_from(x, vertices, faces, groups=groups)
+        assert len(surface.vertex_blocks) > surface.groups  # or nothing would be left out
+        d = np.asarray(smooth()(jnp.asarray(x), jnp.asarray(vertices), surface)[0])
+        # planes that weigh 1e-3 and pass some h away
+        close = np.abs(d - right) < 5e-3 * h
+        assert close.mean() > 0.99 if groups == 12 else close.all()
+
+
+def test_smooth_distance_to_a_ball():
+    """Outside and inside by its sign, and outside the vertices by about h^2/4 times the mean curvature, as it says."""
+    vertices, faces = ball(3, 0.1)
+    directions = np.random.default_rng(2).normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    surface, h = surface_from(0.1 * directions, vertices, faces), mean_edge(vertices, faces)
+    for height in (-2 * h, -h, h, 2 * h):
+        x = (0.1 + height) * directions
+        d, gradient, _ = smooth()(jnp.asarray(x), jnp.asarray(vertices), surface)
+        np.testing.assert_allclose(d, height, rtol=0, atol=0.25 * h)
+        np.testing.assert_allclose(jnp.sum(gradient * directions, axis=1), 1, atol=0.3)
+    d = smooth()(jnp.asarray(0.1 * directions), jnp.asarray(vertices), surface)[0]
+    np.testing.assert_allclose(np.mean(d), -(h**2) / 4 * 2 / 0.1, rtol=0.5)  # there the cloth is that far inside
+
+
+def test_smooth_distance_does_not_jump_where_the_nearest_vertex_changes():
+    """Along a path round a ball: the tangent planes jump from one to the next, their blend does not."""
+    vertices, faces = ball(2, 0.1)
+    t = np.linspace(0, 2, 12001)[:, None]
+    x = 0.11 * np.concatenate([np.cos(t), np.sin(t) * np.cos(0.4), np.sin(t) * np.sin(0.4)], axis=1)
+    surface, body = surface_from(x, vertices, faces), jnp.asarray(vertices)
+    d, gradient, _ = smooth()(jnp.asarray(x), body, surface)
+    index, _ = jax.jit(nearest_vertex)(jnp.asarray(x), body, surface)
+    stairs = np.asarray(plane_distance(jnp.asarray(x), body, vertex_normals(body, surface), index))
+    assert len(np.unique(index)) > 8
+    step = 0.11 * 2 / 12000
+    assert np.abs(np.diff(stairs)).max() > 10 * step
+    assert np.abs(np.diff(d)).max() < 0.5 * step
+    assert np.abs(np.diff(gradient, axis=0)).max() < 50 * step  # 1/m: nor does its slope, at curvatures of some 10/m
+
+
+@pytest.mark.parametrize("name", ["ball", "body"])
+def test_slope_of_the_smooth_distance(name, rng):
+    """By central differences, for the cloth and for the body."""
+    x, vertices, faces = near_skin(name)
+    surface, step = surface_from(x, vertices, faces), 1e-6
+    value = lambda x, body: np.asarray(smooth()(jnp.asarray(x), jnp.asarray(body), surface)[0])  # noqa: E731
+    _, gradient, on_body = smooth()(jnp.asarray(x), jnp.asarray(vertices), surface)
+    for axis in np.eye(3):
+        difference = (value(x + step * axis, vertices) - value(x - step * axis, vertices)) / (2 * step)
+        wrong = np.abs(gradient @ axis - difference) > 1e-5
+        assert wrong.mean() < 2e-3  # where a group comes in and another goes out on the way
+    v = rng.normal(size=vertices.shape)
+    difference = (value(x, vertices + 1e-8 * v) - value(x, vertices - 1e-8 * v)).sum() / 2e-8
+    np.testing.assert_allclose(np.sum(np.asarray(on_body) * v), difference, rtol=1e-4)
+    # moving cloth and body together changes nothing
+    np.testing.assert_allclose(np.sum(on_body, axis=0) + np.sum(gradient, axis=0), 0, atol=1e-8 * len(x))
+
+
+@pytest.mark.parametrize("pose", ["far away", "at the centre, all equally near", "body crushed flat", "body in one point"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_smooth_distance_is_finite_anywhere(pose, dtype):
+    """Far from the body no weight may underflow to nothing over nothing."""
+    x, body = poses()[pose]
+    for value in smooth()(jnp.asarray(x, dtype), jnp.asarray(body, dtype), SURFACE):
+        assert value.dtype == dtype and jnp.all(jnp.isfinite(value))
+
+
+def test_second_derivatives_of_the_smooth_distance_are_finite_and_its_own():
+    """Forward over reverse, as a Newton step takes them, against differences of the slope."""
+    vertices, faces = ball(2, 0.1)
+    x, body = jnp.asarray(CLOTH * 0.9), jnp.asarray(vertices)
+    surface = surface_from(CLOTH, vertices, faces)
+    slope = lambda x: smooth()(x, body, surface)[1]  # noqa: E731
+    v = jnp.asarray(np.random.default_rng(6).normal(size=x.shape))
+    curvature = jax.jit(lambda x, v: jax.jvp(slope, (x,), (v,))[1])(x, v)
+    difference = (slope(x + 1e-6 * v) - slope(x - 1e-6 * v)) / 2e-6
+    np.testing.assert_allclose(curvature, difference, rtol=0, atol=1e-4 * float(jnp.max(jnp.abs(difference))))
 
 
 # --- energy -----------------------------------------------------------------------------------------------------------

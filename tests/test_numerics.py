@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.numerics import angle_between, norm, normalize, signed_angle
+from ncs_jax.numerics import angle_between, norm, normalize, positive_part, signed_angle
 
 # Lengths of the odd row in m: nothing, the least number, just under and over where each type is masked, cloth, large.
 LENGTHS = [0.0, 1e-44, 0.9e-12, 1.1e-12, 1e-11, 1e-10, 1e-9, 1e-7, 1e-5, 1e-3, 1.0, 1e4]
@@ -82,3 +82,73 @@ def test_angles_are_accurate_at_both_ends():
 def test_angle_is_free_of_a_common_scale():
     for k in (1e-10, 1e-3, 1e8):
         np.testing.assert_allclose(signed_angle(jnp.array(3 * k), jnp.array(-4 * k)), np.arctan2(3, -4), rtol=1e-14)
+
+
+# --- the positive part of a matrix --------------------------------------------------------------------------------------
+
+FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+positive = jax.jit(positive_part, compiler_options=FAST)
+LANES = 240
+
+
+def by_eigenvalues(a):
+    """(n, n, lanes) in float64."""
+    values, vectors = np.linalg.eigh(np.moveaxis(np.asarray(a, np.float64), -1, 0))
+    return np.einsum("lik,lk,ljk->ijl", vectors, np.maximum(values, 0), vectors)
+
+
+def symmetric(n, rng):
+    """LANES matrices (n, n, lanes): ordinary ones, then all that an eigenvalue can be."""
+    turns = np.linalg.qr(rng.normal(size=(LANES, n, n)))[0]
+    values = rng.normal(size=(LANES, n))
+    values[40:60] = np.abs(values[40:60])  # positive already
+    values[60:80] = -np.abs(values[60:80])
+    values[80:100] = np.sign(values[80:100])  # repeated, of both signs
+    values[100:110] = values[100:110, :1]  # all equal
+    values[110:120] = 0
+    values[120:140] *= 10.0 ** -np.arange(n)[::-1]  # of very different size
+    values[140:160, 1:] = 0  # rank one
+    values[160:180] = np.array([1, -1] * n)[:n] * (1 + 1e-9 * values[160:180])  # nearly repeated
+    turns[180:220] = np.eye(n)  # diagonal
+    a = np.einsum("lik,lk,ljk->ijl", turns, values, turns)
+    a[..., 200:220] += 1e-12 * rng.normal(size=(n, n, 20))  # and nearly
+    return (a + a.transpose(1, 0, 2)) / 2
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+def test_positive_part_against_eigenvalues(n, dtype, rng):
+    a = jnp.asarray(symmetric(n, rng), dtype)
+    got = positive(a)
+    assert got.dtype == dtype and got.shape == a.shape
+    right, rounding = by_eigenvalues(a), 1e-5 if dtype == jnp.float32 else 1e-11
+    np.testing.assert_allclose(np.asarray(got), right, rtol=0, atol=rounding)
+    # what is positive already stays, what is negative goes, and what is nothing stays nothing
+    np.testing.assert_allclose(np.asarray(got[..., 40:60]), np.asarray(a[..., 40:60]), rtol=0, atol=rounding)
+    np.testing.assert_allclose(np.asarray(got[..., 60:80]), 0, atol=rounding)
+    np.testing.assert_array_equal(got[..., 110:120], 0)
+    # every matrix of a batch is by itself
+    np.testing.assert_array_equal(got[..., :120], positive(jnp.concatenate([a[..., :120], a[..., :120]], axis=-1))[..., 120:])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_positive_part_at_every_scale(dtype, rng):
+    """A scale of the matrix is one of the result, down to where the type ends."""
+    a = symmetric(4, rng)
+    scales = (1e-30, 1e-12, 1e12, 1e30) if dtype == jnp.float32 else (1e-290, 1e-150, 1e150, 1e300)
+    right = by_eigenvalues(a)
+    for scale in scales:
+        got = np.asarray(positive(jnp.asarray(a * scale, dtype)), np.float64) / scale
+        np.testing.assert_allclose(got, right, rtol=0, atol=1e-5 if dtype == jnp.float32 else 1e-13)
+    mixed = scales[0] * (np.arange(LANES) % 2) + scales[3] * (np.arange(LANES) % 2 == 0)  # side by side in one batch
+    got = np.asarray(positive(jnp.asarray(a * mixed, dtype)), np.float64) / mixed
+    np.testing.assert_allclose(got, right, rtol=0, atol=1e-5 if dtype == jnp.float32 else 1e-13)
+
+
+def test_positive_part_of_what_is_not_a_number_spoils_no_neighbour(rng):
+    a = symmetric(4, rng)
+    clean = np.asarray(positive(jnp.asarray(a)))
+    a[1, 2, 7] = a[2, 1, 7] = np.nan
+    got = np.asarray(positive(jnp.asarray(a)))
+    assert np.isnan(got[..., 7]).any()
+    np.testing.assert_array_equal(np.delete(got, 7, axis=-1), np.delete(clean, 7, axis=-1))

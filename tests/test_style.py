@@ -21,12 +21,13 @@ MODULES["ncs_jax"] = MODULES.pop("__init__")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 HEAVY = {"trimesh", "h5py", "matplotlib", "PIL", "rich", "orbax", "tensorboardX"}
 PICTURES = {"pictures", "rasteriser", "preview", "viewer"}  # these exist to draw
-OUTSIDE = {"io", "scene", "assembly", "checkpoint", "runs", "cli"} | PICTURES  # read files, print or draw
+OUTSIDE = {"io", "scene", "assembly", "checkpoint", "runs", "simulation", "cli"} | PICTURES  # read files, print or draw
 
 # What each part of the numeric core may import of the package: itself, and what stands below it.
 BELOW: dict[str, set[str]] = {
     "numerics": set(),
     "modes": set(),
+    "cholesky": set(),
     "networks": set(),
     "kinematics": set(),
     "rotations": {"numerics"},
@@ -34,6 +35,8 @@ BELOW: dict[str, set[str]] = {
     "energies": {"numerics", "mesh"},
     "descriptors": {"numerics", "rotations"},
     "objective": {"energies", "kinematics", "mesh"},
+    "stiffness": {"mesh", "numerics", "objective"},
+    "simulator": {"cholesky", "energies", "kinematics", "model", "motion", "objective", "stiffness"},
     "model": {"energies", "kinematics", "objective", "rotations"},
     "motion": {"descriptors", "kinematics", "model"},
     "methods": {"descriptors", "kinematics", "model", "motion", "networks"},

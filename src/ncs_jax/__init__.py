@@ -8,6 +8,7 @@ from ncs_jax.objective import Frame, Garment, Material, Terms, energies, total
 from ncs_jax.rollout import animate, stepper
 from ncs_jax.runs import Report, Run, load_run, train
 from ncs_jax.scene import Scene, load_scene, scene_from
+from ncs_jax.simulation import Trajectory, simulate
 
 __all__ = [
     "Assembly",
@@ -20,6 +21,7 @@ __all__ = [
     "Run",
     "Scene",
     "Terms",
+    "Trajectory",
     "animate",
     "assemble",
     "energies",
@@ -28,6 +30,7 @@ __all__ = [
     "local_rotations",
     "measure",
     "scene_from",
+    "simulate",
     "stepper",
     "summarise",
     "total",

@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, animate, evaluate, check."""
+"""The command line: ncs demo, train, animate, simulate, evaluate, check."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs demo                          train the packaged T-shirt and write a preview to look at
   ncs train SCENE --out RUN         train the garment of a scene file (ncs:tshirt and ncs:skirt come with the package)
   ncs animate RUN --out FILE        animate a trained garment
+  ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
 """
@@ -69,6 +70,14 @@ def _parser() -> argparse.ArgumentParser:
         "--alpha", type=_finite, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates"
     )
     animate.add_argument("--out", required=True, metavar="FILE", help=".npz, .h5, .pc2, or a folder of .obj")
+
+    simulate = command("simulate", _simulate, "animate the garment of a scene by full-space simulation, without a network")
+    simulate.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
+    simulate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    simulate.add_argument(
+        "--out", required=True, metavar="FILE",
+        help=".npz, .h5, .pc2, or a folder of .obj; an interrupted simulation goes on from FILE.partial.npz",
+    )  # fmt: skip
 
     evaluate = command("evaluate", _evaluate, "measure strain, shear, penetration, energies and forces out of balance")
     evaluate.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
@@ -207,6 +216,39 @@ def _animate(options) -> int:
     vertices = run.animate(motions[0], options.alpha)
     io.write_animation(options.out, vertices, run.assembly.garment.faces, run.assembly.model.fps)
     print(f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices")
+    return 0
+
+
+def _simulate(options) -> int:
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from ncs_jax import io
+    from ncs_jax.simulation import simulate
+
+    partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
+    console = Console()
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("reading the scene and compiling", total=None)
+
+        def show(p):
+            text = f"frame {p.frame}/{p.frames}  {p.iterations} iterations  {p.residual:.3g} g  {_clock(p.left)} left"
+            progress.update(task, total=p.frames, completed=p.frame, description=text)
+            if not console.is_terminal and (p.frame % 30 == 0 or p.frame == p.frames):
+                print(text, flush=True)
+
+        result = simulate(options.scene, options.motion, partial=partial, report=show)
+    io.write_animation(options.out, result.vertices, result.assembly.garment.faces, result.fps)
+    partial.unlink(missing_ok=True)
+    print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
+    print(f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g")
+    for status, text in ((1, "out of iterations"), (2, "no step lowers the energy further"), (3, "not finite")):
+        frames = np.flatnonzero(result.status == status)
+        if frames.size:
+            worst = result.residual[frames].max()
+            print(f"  {frames.size} frames not at tolerance: {text} (first: frame {frames[0]}, worst {worst:.3g} g)")
     return 0
 
 

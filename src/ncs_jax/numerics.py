@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-__all__ = ["angle_between", "norm", "normalize", "signed_angle"]
+__all__ = ["angle_between", "norm", "normalize", "positive_part", "signed_angle"]
 
 
 def _least(dtype):
@@ -46,3 +46,48 @@ def angle_between(a: Float[Array, "*rows 3"], b: Float[Array, "*rows 3"]) -> Flo
     """Angle in [0, pi] between two vectors by atan2(|a x b|, a . b), accurate at 0 and at pi; zero where one vanishes."""
     a, b = normalize(a), normalize(b)
     return signed_angle(norm(jnp.cross(a, b)), jnp.sum(a * b, axis=-1))
+
+
+def positive_part(a: Float[Array, "n n *lanes"], sweeps: int = 6) -> Float[Array, "n n *lanes"]:
+    """Nearest positive semi-definite matrices to small symmetric ones: V max(Lambda, 0) V^T, by cyclic Jacobi rotations.
+
+    The matrices lie across the lanes, so that thousands are turned at once; six sweeps reach rounding for n up to 6
+    (`tests/test_numerics.py`). Source: Golub and Van Loan, 8.5.
+    """
+    n = a.shape[0]
+    pairs = [(p, q) for p in range(n) for q in range(p + 1, n)]
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=a.dtype).reshape(n, n, *(1,) * (a.ndim - 2)), a.shape)
+    size = jnp.max(jnp.abs(a), axis=(0, 1))
+    scale = jnp.where(size > 0, size, 1)
+
+    def sweep(_, state):
+        m = {(i, j): state[0][i, j] for i in range(n) for j in range(i, n)}
+        v = {(i, j): state[1][i, j] for i in range(n) for j in range(n)}
+
+        def at(i, j):
+            return (i, j) if i <= j else (j, i)
+
+        for p, q in pairs:
+            off = m[p, q]
+            none = off == 0
+            ratio = (m[q, q] - m[p, p]) / (2 * jnp.where(none, 1, off))
+            t = jnp.where(none, 0, jnp.where(ratio >= 0, 1, -1) / (jnp.abs(ratio) + jnp.sqrt(ratio * ratio + 1)))
+            c = 1 / jnp.sqrt(t * t + 1)
+            s = t * c
+            m[p, p], m[q, q], m[p, q] = m[p, p] - t * off, m[q, q] + t * off, jnp.zeros_like(off)
+            for r in range(n):
+                if r not in (p, q):
+                    x, y = m[at(r, p)], m[at(r, q)]
+                    m[at(r, p)], m[at(r, q)] = c * x - s * y, s * x + c * y
+                x, y = v[r, p], v[r, q]
+                v[r, p], v[r, q] = c * x - s * y, s * x + c * y
+        return (
+            jnp.stack([jnp.stack([m[at(i, j)] for j in range(n)]) for i in range(n)]),
+            jnp.stack([jnp.stack([v[i, j] for j in range(n)]) for i in range(n)]),
+        )
+
+    values, vectors = lax.fori_loop(0, sweeps, sweep, (a / scale[None, None], eye))
+    kept = [jnp.maximum(values[k, k], 0) * scale for k in range(n)]
+    return jnp.stack(
+        [jnp.stack([sum(vectors[i, k] * kept[k] * vectors[j, k] for k in range(n)) for j in range(n)]) for i in range(n)]
+    )

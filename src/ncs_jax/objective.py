@@ -10,6 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ncs_jax.energies import baraff_witkin as _baraff_witkin
+from ncs_jax.energies import neo_hookean as _neo_hookean
+from ncs_jax.energies import stvk as _stvk
 from ncs_jax.energies.baraff_witkin import baraff_witkin
 from ncs_jax.energies.bending import bending
 from ncs_jax.energies.collision import (
@@ -18,6 +21,7 @@ from ncs_jax.energies.collision import (
     nearest_triangle,
     nearest_vertex,
     plane_distance,
+    smooth_distance,
     triangle_distance,
     vertex_normals,
 )
@@ -30,13 +34,19 @@ from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import Mesh
 
-__all__ = ["MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "total"]
+__all__ = ["DENSITIES", "MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "total"]
 
 MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
     "stvk": (stvk, ("lam", "mu")),
     "neo_hookean": (neo_hookean, ("lam", "mu")),
     "baraff_witkin": (baraff_witkin, ("stretch", "shear")),
     "mass_spring": (mass_spring, ("stiffness",)),
+}
+
+DENSITIES: dict[str, Callable[..., Array]] = {  # energy per rest area of the membranes that are made of faces
+    "stvk": _stvk.density,
+    "neo_hookean": _neo_hookean.density,
+    "baraff_witkin": _baraff_witkin.density,
 }
 
 
@@ -46,7 +56,7 @@ class Terms:
 
     membrane: str | None = "stvk"
     bending: bool = True
-    collision: str | None = "plane"  # "plane", "triangle" or None
+    collision: str | None = "plane"  # "plane", "smooth", "triangle" or None
     exact: bool = True  # exact search; otherwise candidates alone
     gravity: bool = True
     inertia: bool = True
@@ -95,6 +105,8 @@ def distances(
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
         return triangle_distance(x, body, surface, index)
+    if terms.collision == "smooth":
+        return smooth_distance(x, body, vertex_normals(body, surface), surface)
     index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
     return plane_distance(x, body, vertex_normals(body, surface), index)
 

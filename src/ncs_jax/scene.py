@@ -26,6 +26,7 @@ __all__ = [
     "PhysicsSpec",
     "PinningSpec",
     "Scene",
+    "SimulationSpec",
     "TrainingSpec",
     "load_scene",
     "packaged",
@@ -100,7 +101,7 @@ class CollisionSpec:
 
     stiffness: float = _f(10.0, "k_c, J/m^2 a vertex; 0: no collision", low=0, high=1e9)
     thickness: float = _f(0.004, "distance to keep from the body, m", low=0, high=0.1)
-    distance: str = _f("plane", "signed distance to the body", choices=("plane", "triangle"))
+    distance: str = _f("plane", "signed distance to the body", choices=("plane", "smooth", "triangle"))
     search: str = _f("exact", "search for the nearest feature", choices=("exact", "candidates"))
     reach: float = _f(0.08, "how near to the skinned garment the body can be touched, m", low=0.005, high=10)
 
@@ -152,6 +153,15 @@ class TrainingSpec:
 
 
 @dataclass(frozen=True)
+class SimulationSpec:
+    """[simulation]: how `ncs simulate` solves a frame."""
+
+    tolerance: float = _f(0.0, "out-of-balance acceleration, g; 0: 0.1 in float32, 0.001 in float64", low=0, high=1e6)
+    iterations: int = _f(100, "most iterations a step", low=1, high=1_000_000)
+    substeps: int = _f(1, "steps a frame", low=1, high=1000)
+
+
+@dataclass(frozen=True)
 class Scene:
     """A validated scene. `source` is the file it came from; relative paths resolve from its folder."""
 
@@ -161,6 +171,7 @@ class Scene:
     physics: PhysicsSpec = _f(PhysicsSpec, "")
     network: NetworkSpec = _f(NetworkSpec, "")
     training: TrainingSpec = _f(TrainingSpec, "")
+    simulation: SimulationSpec = _f(SimulationSpec, "")
     source: str = field(default="", metadata={"internal": True})
 
     def path(self, name: str) -> Path:

@@ -1,0 +1,312 @@
+"""Sparse Cholesky factorisation of matrices with one 3x3 block a pair of coupled vertices, by nested dissection.
+
+A garment's couplings never change, so the order of elimination is found once; the numbers then pass through dense fronts
+(Duff and Reid 1983), one batch of equal fronts a level of the dissection tree. All of it is batched matrix products and small
+dense factorisations: it is compiled, mapped over batches and runs wherever JAX does.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+__all__ = ["Elimination", "Factor", "elimination", "factorise", "solve"]
+
+LEAF = 24  # vertices that a dissection no longer divides
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Group:
+    """Fronts of one depth of the dissection tree and of about one size, padded to the same.
+
+    A front is a dense matrix over its pivots, which are eliminated here, and its border: vertices that are eliminated later.
+    """
+
+    pivots: Int[Array, "fronts pivots"]  # vertex, or `verts` where padded
+    border: Int[Array, "fronts border"]
+    blocks: Int[Array, "entries"]  # off-diagonal blocks that enter here
+    places: Int[Array, "entries 3"]  # where: front, row, column
+    flipped: Int[Array, "entries"]  # 1: the block enters transposed
+    children: Int[Array, "fronts 2 local"] | None  # row in the updates of the depth below that a local row takes
+    columns: Int[Array, "fronts 2 local"] | None  # and its place among the columns of that update
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Elimination:
+    """In which order and where the blocks of a matrix are eliminated; levels from the leaves to the root."""
+
+    levels: tuple[tuple[Group, ...], ...]
+    verts: int = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Factor:
+    """L L^T = A: of each level the inverse pivot factors L^-1 and the rows L^-1 A of the border."""
+
+    inverse: tuple[Float[Array, "fronts p p"], ...]
+    border: tuple[Float[Array, "fronts p b"], ...]
+
+
+# --- order, once ----------------------------------------------------------------------------------------------------
+
+
+def _separator(left: np.ndarray, right: np.ndarray, crossing: np.ndarray, verts: int) -> np.ndarray:
+    """Fewest vertices that touch every crossing pair (pairs, 2) from left to right: a minimum vertex cover (Koenig)."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    a, i = np.unique(crossing[:, 0], return_inverse=True)
+    b, j = np.unique(crossing[:, 1], return_inverse=True)
+    graph = csr_matrix((np.ones(len(i), np.int8), (i, j)), shape=(len(a), len(b)))
+    match_of_a = maximum_bipartite_matching(graph, perm_type="column")
+    match_of_b = np.full(len(b), -1)
+    match_of_b[match_of_a[match_of_a >= 0]] = np.flatnonzero(match_of_a >= 0)
+    seen_a, seen_b = match_of_a < 0, np.zeros(len(b), bool)
+    front = np.flatnonzero(seen_a)
+    while front.size:  # alternating paths from the free ones
+        reached = np.unique(graph[front].indices)
+        reached = reached[~seen_b[reached]]
+        seen_b[reached] = True
+        front = match_of_b[reached]
+        front = front[~seen_a[front]]
+        seen_a[front] = True
+    return np.concatenate([a[~seen_a], b[seen_b]])
+
+
+def _halve(members: np.ndarray, points: np.ndarray, pairs: np.ndarray, verts: int):
+    """Split vertices into two parts without a pair between them, and the separator; `pairs` are those inside `members`."""
+    at = points[members] - points[members].mean(axis=0)
+    axes = np.linalg.svd(at, full_matrices=False)[2]
+    directions = np.concatenate([axes, [axes[0] + axes[1], axes[0] - axes[1]]])
+    best = None
+    for direction in directions:
+        height = at @ direction
+        order = np.argsort(height, kind="stable")
+        for share in (0.45, 0.5, 0.55):
+            side = np.zeros(verts, bool)
+            side[members[order[: int(share * len(order))]]] = True
+            crossing = pairs[side[pairs[:, 0]] != side[pairs[:, 1]]]
+            if not len(crossing):
+                separator = np.zeros(0, np.int64)
+            else:
+                crossing = np.where(side[crossing[:, :1]], crossing, crossing[:, ::-1])
+                separator = _separator(members, members, crossing, verts)
+            parts = np.bincount(side[np.setdiff1d(members, separator)], minlength=2)
+            cost = len(separator) * (1 + 4 * abs(parts[0] - parts[1]) / max(parts.sum(), 1))
+            if best is None or cost < best[0]:
+                best = cost, side.copy(), separator
+    _, side, separator = best
+    rest = np.setdiff1d(members, separator)
+    return rest[side[rest]], rest[~side[rest]], np.sort(separator)
+
+
+def elimination(pairs: np.ndarray, points: np.ndarray) -> Elimination:
+    """Find a good order for vertices coupled in `pairs` (pairs, 2) that lie at `points` (verts, 3), m.
+
+    Off-diagonal block k of a matrix then couples vertex pairs[k, 0] (rows) with pairs[k, 1] (columns).
+    """
+    pairs, points = np.asarray(pairs, np.int64), np.asarray(points, np.float64)
+    verts = len(points)
+    depth = max(0, int(np.round(np.log2(max(verts / LEAF, 1)))))
+    nodes = [(np.arange(verts), pairs)]
+    tree: list[list[np.ndarray]] = []
+    for _ in range(depth):
+        separators, below = [], []
+        for members, inside in nodes:
+            if len(members) < 2:
+                left, right, separator = members[:0], members[:0], members
+            else:
+                left, right, separator = _halve(members, points, inside, verts)
+            separators.append(separator)
+            for part in (left, right):
+                mask = np.zeros(verts, bool)
+                mask[part] = True
+                below.append((part, inside[mask[inside].all(axis=1)]))
+        tree.append(separators)
+        nodes = below
+    tree.append([members for members, _ in nodes])
+    return _symbolic(tree, pairs, verts)
+
+
+def _symbolic(tree: list[list[np.ndarray]], pairs: np.ndarray, verts: int) -> Elimination:
+    from scipy.sparse import csr_matrix
+
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    graph = csr_matrix((np.ones(len(both), np.int8), both.T), shape=(verts, verts))
+    rank, depth_of, node_of, place_of = (np.zeros(verts, np.int64) for _ in range(4))
+    count = 0
+    for depth in range(len(tree) - 1, -1, -1):
+        for node, members in enumerate(tree[depth]):
+            rank[members] = count + np.arange(len(members))
+            depth_of[members], node_of[members], place_of[members] = depth, node, np.arange(len(members))
+            count += len(members)
+    first = rank[pairs].argmin(axis=1)  # a block enters where the first of its two vertices is eliminated
+    early, late = pairs[np.arange(len(pairs)), first], pairs[np.arange(len(pairs)), 1 - first]
+    levels: list[tuple[Group, ...]] = []
+    below: list[np.ndarray] = []  # borders of the nodes one level deeper
+    position = np.zeros(0, np.int64)  # of a node one level deeper among the updates
+    widest = 0
+    for depth in range(len(tree) - 1, -1, -1):
+        own = tree[depth]
+        borders = []
+        for node, members in enumerate(own):
+            parts = [np.unique(graph[members].indices)] + [below[c] for c in (2 * node, 2 * node + 1) if below]
+            border = np.unique(np.concatenate(parts)).astype(np.int64)
+            border = border[depth_of[border] < depth]
+            borders.append(border[np.argsort(rank[border])])
+        entering = np.flatnonzero(depth_of[early] == depth)
+        groups = []
+        order = []
+        for nodes in _groups([len(m) for m in own], [len(b) for b in borders]):
+            p, b = max(len(own[n]) for n in nodes), max(len(borders[n]) for n in nodes)
+            local = np.full((len(nodes), p + b), verts)
+            place = np.zeros((len(nodes), verts + 1), np.int64)
+            for i, n in enumerate(nodes):
+                local[i, : len(own[n])] = own[n]
+                local[i, p : p + len(borders[n])] = borders[n]
+                place[i, local[i]] = np.arange(p + b)
+            index = np.full(len(own), -1)
+            index[nodes] = np.arange(len(nodes))
+            mine = entering[index[node_of[early[entering]]] >= 0]
+            front = index[node_of[early[mine]]]
+            children = columns = None
+            if below:
+                columns = np.full((len(nodes), 2, p + b), widest)
+                for i, n in enumerate(nodes):
+                    for k in range(2):
+                        lookup = np.full(verts + 1, widest)
+                        lookup[below[2 * n + k]] = np.arange(len(below[2 * n + k]))
+                        columns[i, k] = lookup[local[i]]
+                update = position[2 * np.asarray(nodes)[:, None] + np.arange(2)]
+                children = update[:, :, None] * (widest + 1) + columns
+            array = lambda a: None if a is None else jnp.asarray(a, jnp.int32)  # noqa: E731
+            groups.append(
+                Group(
+                    pivots=array(local[:, :p]),
+                    border=array(local[:, p:]),
+                    blocks=array(mine),
+                    places=array(np.stack([front, place[front, late[mine]], place_of[early[mine]]], axis=1)),
+                    flipped=array(first[mine] == 0),
+                    children=array(children),
+                    columns=array(columns),
+                )
+            )
+            order += list(nodes)
+        levels.append(tuple(groups))
+        position = np.argsort(order)
+        below, widest = borders, max(len(b) for b in borders)
+    return Elimination(tuple(levels), verts)
+
+
+def _groups(pivots: list[int], border: list[int], most: int = 3) -> list[list[int]]:
+    """Split the fronts of a level into at most `most` groups of similar size, so that little work is spent on padding."""
+    p, b = np.asarray(pivots), np.asarray(border)
+    order = np.argsort(p + b, kind="stable")
+    p, b = p[order], b[order]
+
+    def cost(i, j):
+        size, rim = p[i:j].max(), b[i:j].max()
+        return (j - i) * size * (size + rim) ** 2 + 2e5  # in block products; the last: what a group costs by itself
+
+    cuts = sorted({int(c) for c in np.linspace(0, len(p), 17)[1:-1]} - {0, len(p)})
+    ways: list[tuple[int, ...]] = [()]
+    for count in range(1, most):
+        ways += itertools.combinations(cuts, count)
+    ends = min(((0, *way, len(p)) for way in ways), key=lambda ends: sum(cost(i, j) for i, j in itertools.pairwise(ends)))
+    return [sorted(order[i:j].tolist()) for i, j in itertools.pairwise(ends)]
+
+
+# --- numbers --------------------------------------------------------------------------------------------------------
+
+
+def _triple(index: Array) -> Array:
+    """Rows of scalars of rows of blocks."""
+    return jnp.stack([3 * index, 3 * index + 1, 3 * index + 2], axis=-1).reshape(*index.shape[:-1], -1)
+
+
+def factorise(order: Elimination, diagonal: Float[Array, "verts 3 3"], off: Float[Array, "pairs 3 3"]) -> Factor:
+    """Factor a symmetric positive definite matrix; NaN where it is not."""
+    dtype = diagonal.dtype
+    inverses, rows = [], []
+    updates = None
+    token = jnp.zeros((), dtype)
+    padded = jnp.concatenate([diagonal, jnp.eye(3, dtype=dtype)[None]])
+    for level in order.levels:
+        widest = max(g.border.shape[1] for g in level)
+        count = sum(len(g.pivots) for g in level)
+        left = jnp.zeros((count, 3 * (widest + 1), 3 * (widest + 1)), dtype)
+        first = 0
+        for group in level:
+            fronts, p = group.pivots.shape
+            b = group.border.shape[1]
+            front = jnp.zeros((fronts, 3 * (p + b), 3 * (p + b)), dtype) if updates is None else _taken(group, updates)
+            corner = front[:, 3 * p :, 3 * p :]
+            # One group after the other: LAPACK, called from two threads at once, hangs XLA's CPU client (jaxlib 0.10).
+            front = _entered(group, front[:, :, : 3 * p], padded + 0 * token, off)
+            lower = jnp.linalg.cholesky(front[:, : 3 * p], symmetrize_input=False)
+            eye = jnp.broadcast_to(jnp.eye(3 * p, dtype=dtype), lower.shape)
+            inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
+            row = jnp.einsum("fij,fbj->fib", inverse, front[:, 3 * p :], precision="highest")
+            inverses.append(inverse)
+            rows.append(row)
+            if b:
+                token = row[0, 0, 0] if p else token
+                update = corner - jnp.einsum("fpa,fpb->fab", row, row, precision="highest")
+                left = lax.dynamic_update_slice(left, update, (first, 0, 0))
+            first += fronts
+        updates = lax.optimization_barrier(left)
+    return Factor(tuple(inverses), tuple(rows))
+
+
+def _entered(group: Group, front, diagonal, off):
+    """Add the blocks of the matrix that enter at a group's fronts (fronts, 3 local, 3 pivots)."""
+    fronts, p = group.pivots.shape
+    m = p + group.border.shape[1]
+    front = front.reshape(fronts, m, 3, p, 3)
+    if group.blocks.shape[0]:
+        blocks = off[group.blocks]
+        blocks = jnp.where(group.flipped[:, None, None] == 1, jnp.swapaxes(blocks, -1, -2), blocks)
+        f, i, j = group.places.T
+        front = front.at[f, i, :, j, :].add(blocks, mode="promise_in_bounds", unique_indices=True)
+    k = jnp.arange(p)
+    front = front.at[:, k, :, k, :].add(jnp.moveaxis(diagonal[group.pivots], 1, 0), unique_indices=True)
+    return front.reshape(fronts, 3 * m, 3 * p)
+
+
+def _taken(group: Group, updates):
+    """The sum of what the two children of every front leave to it, in its own order: (fronts, 3 local, 3 local)."""
+    fronts, _, m = group.children.shape
+    size = updates.shape[-1]
+    rows = _triple(group.children.reshape(2 * fronts, m))
+    rows = lax.optimization_barrier(updates.reshape(-1, size).at[rows].get(mode="promise_in_bounds"))
+    columns = _triple(group.columns.reshape(2 * fronts, m))
+    taken = lax.optimization_barrier(jnp.take_along_axis(rows, columns[:, None, :], axis=2))
+    taken = taken.reshape(fronts, 2, 3 * m, 3 * m)
+    return taken[:, 0] + taken[:, 1]
+
+
+def solve(order: Elimination, factor: Factor, right: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """x with A x = right."""
+    x = jnp.concatenate([right, jnp.zeros((1, 3), right.dtype)])
+    groups = [g for level in order.levels for g in level]
+    halves = []
+    for group, inverse, row in zip(groups, factor.inverse, factor.border, strict=True):
+        y = jnp.einsum("fij,fj->fi", inverse, x[group.pivots].reshape(len(group.pivots), -1), precision="highest")
+        down = jnp.einsum("fpb,fp->fb", row, y, precision="highest")
+        x = x.at[group.border].add(-down.reshape(*group.border.shape, 3))
+        halves.append(y)
+    for group, inverse, row, y in zip(groups[::-1], factor.inverse[::-1], factor.border[::-1], halves[::-1], strict=True):
+        above = x[group.border].reshape(len(group.border), -1)
+        y = y - jnp.einsum("fpb,fb->fp", row, above, precision="highest")
+        z = jnp.einsum("fij,fi->fj", inverse, y, precision="highest")
+        x = x.at[group.pivots].set(z.reshape(*group.pivots.shape, 3)).at[-1].set(0)
+    return x[:-1]

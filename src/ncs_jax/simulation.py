@@ -1,0 +1,149 @@
+"""Simulate a scene's garment over a motion, frame by frame, with progress and resumption."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
+from ncs_jax.errors import InputError
+from ncs_jax.io.npz import read_npz, write_npz
+from ncs_jax.scene import Scene, load_scene
+from ncs_jax.simulator import Settings, Simulator, Solution, State, simulator_from, stepper
+
+__all__ = ["Progress", "Trajectory", "simulate"]
+
+SAVE_EVERY = 10.0  # s
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a simulation says after every frame."""
+
+    frame: int
+    frames: int
+    iterations: int
+    residual: float  # g
+    status: int
+    left: float  # s
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A simulated garment: vertices (frames, verts, 3) in m, and of every frame how its solve went, see `Solution`.
+
+    With substeps, `iterations` is their sum, and `residual` and `status` are the worst of them.
+    """
+
+    vertices: np.ndarray
+    iterations: np.ndarray
+    residual: np.ndarray  # g
+    status: np.ndarray
+    fps: float
+    assembly: Assembly
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _follow(simulator: Simulator, settings: Settings, state: State, matrices):
+    return stepper(simulator, settings).follow(state, matrices)
+
+
+def simulate(
+    scene: Scene | str | Path,
+    motion: str | None = None,
+    *,
+    partial: str | Path | None = None,
+    dtype=jnp.float32,
+    report: Callable[[Progress], None] | None = None,
+) -> Trajectory:
+    """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
+
+    Args:
+        scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
+            first. partial: a file that keeps what is done while it runs and is continued from where it exists. dtype: float64
+            needs JAX's x64 mode. report: called after every frame.
+
+    Raises:
+        InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
+    """
+    scene = load_scene(scene) if isinstance(scene, str | Path) else scene
+    spec = scene.simulation
+    named = (*scene.motion.files, *scene.motion.validation)
+    name = motion or (named[0] if named else None)
+    if name is not None and not name.startswith("ncs:") and name not in named:
+        name = str(Path(name).absolute())
+    fine = scene.motion.fps * spec.substeps
+    # What can be touched is found out from this motion, and nothing is prepared for a network.
+    lone = replace(
+        scene,
+        motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False),
+        network=replace(scene.network, modes=0),
+    )
+    assembly = assemble(lone, dtype=dtype)
+    model = assembly.model
+    records = [] if name is None else [load_motion(lone, name, assembly.body)]
+    matrices = (track_of(model, *records) if records else assembly.track).matrices
+    settings = Settings(tolerance=spec.tolerance or None, iterations=spec.iterations)
+    simulator = simulator_from(model)
+    state = stepper(simulator, settings).init()
+    frames = 1 + (len(matrices) - 1) // spec.substeps
+    identity = json.dumps([scene.to_dict(), name, frames, jnp.dtype(dtype).name], sort_keys=True)
+    done: dict[str, np.ndarray] = {
+        "vertices": np.zeros((0, *model.garment.mesh.rest.shape), jnp.dtype(dtype)),
+        "iterations": np.zeros(0, np.int64),
+        "residual": np.zeros(0),
+        "status": np.zeros(0, np.int64),
+    }
+    if partial is not None and Path(partial).exists():
+        done, state = _continued(Path(partial), identity, done, matrices, spec.substeps)
+    rows: dict[str, list] = {key: list(values) for key, values in done.items()}
+    begun = saved = time.monotonic()
+    first = len(rows["status"])
+    for t in range(first, frames):
+        solutions: list[Solution] = []
+        for k in range((t - 1) * spec.substeps + 1 if t else 0, t * spec.substeps + 1):
+            state, x = _follow(simulator, settings, state, matrices[k])
+            solutions.append(jax.device_get(state.solution))
+        rows["vertices"].append(np.asarray(x))
+        rows["iterations"].append(sum(int(s.iterations) for s in solutions))
+        rows["residual"].append(max(float(s.residual) for s in solutions))
+        rows["status"].append(max(int(s.status) for s in solutions))
+        now = time.monotonic()
+        if report is not None:
+            left = (now - begun) / (t + 1 - first) * (frames - 1 - t)
+            report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
+        if partial is not None and now - saved > SAVE_EVERY and t + 1 < frames:
+            arrays = {key: np.asarray(values) for key, values in rows.items()}
+            write_npz(partial, before=np.asarray(state.before), identity=np.asarray(identity), **arrays)
+            saved = time.monotonic()
+    arrays = {key: np.asarray(values) for key, values in rows.items()}
+    return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
+
+
+def _continued(partial: Path, identity: str, like: dict[str, np.ndarray], matrices, substeps: int):
+    """The frames that are done, and the state to go on from."""
+    table = read_npz(partial, {*like, "before", "identity"}.__contains__)
+    if str(table.array("identity")) != identity:
+        raise InputError(
+            "the same scene and motion expected", file=partial, field="identity", value="another simulation's",
+            mend="delete this file to begin anew",
+        )  # fmt: skip
+    done = {key: np.asarray(table.array(key), values.dtype) for key, values in like.items()}
+    last = len(done["status"]) - 1
+    nothing = Solution(jnp.zeros((), jnp.int32), jnp.zeros((), matrices.dtype), jnp.zeros((), jnp.int32))
+    state = State(
+        jnp.asarray(done["vertices"][last]),
+        jnp.asarray(table.array("before")),
+        matrices[last * substeps],
+        jnp.asarray(True),
+        nothing,
+    )
+    return done, state

@@ -1,0 +1,337 @@
+"""Full-space simulation: every frame is one step of implicit Euler, the minimum of the energy that trains the network.
+
+    x_t = argmin_x  E(x) + 1/(2 dt^2) sum_v m |x - x_proj|^2,   x_proj = 2 x_{t-1} - x_{t-2}
+
+The minimum is found by projected Newton: element Hessians made positive semi-definite, a sparse Cholesky factorisation, and a
+line search that accepts no increase. Source: Baraff and Witkin 1998; Martin et al. 2011; Teran et al. 2005.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ncs_jax.cholesky import Elimination, elimination, factorise, solve
+from ncs_jax.energies.inertia import inertia, project
+from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
+from ncs_jax.model import Model, pose_body
+from ncs_jax.motion import Track
+from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.stiffness import Couplings, couplings_from, stiffness
+
+__all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Simulation", "Simulator", "Solution", "simulate",
+           "simulator_from", "stepper"]  # fmt: skip
+
+CONVERGED, LIMIT, STALLED, NOT_FINITE = range(4)
+STANDARD_GRAVITY = 9.81  # m/s^2, the unit of residuals
+
+CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
+LEAST_STEP = 1e-6  # of a Newton step: below it the line search gives up
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a frame is solved. tolerance: out-of-balance acceleration in g; None: 0.1 in float32, 0.001 in float64."""
+
+    tolerance: float | None = None
+    iterations: int = 100
+    first: int = 1000  # iterations of the first frame, which starts far from rest
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Simulator:
+    """A model with what its solver finds out once: which vertices couple, and in which order they are eliminated."""
+
+    model: Model
+    couplings: Couplings
+    order: Elimination
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Solution:
+    """How the solve of a frame went.
+
+    residual: out-of-balance acceleration, the mass-weighted r.m.s. of M^-1 grad E, in multiples of 9.81 m/s^2.
+    status: CONVERGED, LIMIT (out of iterations), STALLED (no step lowers the energy) or NOT_FINITE.
+    """
+
+    iterations: Int[Array, "*frames"]
+    residual: Float[Array, "*frames"]
+    status: Int[Array, "*frames"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """What goes from frame to frame: the two last positions, the joints' transforms of the last, how its solve went."""
+
+    previous: Float[Array, "verts 3"]
+    before: Float[Array, "verts 3"]
+    matrices: Float[Array, "joints 3 4"]
+    started: Bool[Array, ""]
+    solution: Solution
+
+
+class Simulation(NamedTuple):
+    """`init() -> state`; `step(state, rotations, translation) -> (state, vertices)`, as of a network's `Rollout`."""
+
+    init: Callable
+    step: Callable
+    follow: Callable  # the same step from the joints' transforms (joints, 3, 4)
+
+
+def simulator_from(model: Model) -> Simulator:
+    """Precompute a model's couplings and order of elimination."""
+    couplings = couplings_from(model.garment.mesh)
+    return Simulator(model, couplings, elimination(np.asarray(couplings.pairs), np.asarray(model.garment.mesh.rest)))
+
+
+def _dot(a, b):
+    return jnp.sum(a * b)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Step:
+    """All that one frame's energy depends on beside the positions."""
+
+    simulator: Simulator
+    body: Float[Array, "body 3"] | None  # posed
+    blended: Float[Array, "verts 3 4"] | None  # skinning transforms of the garment, where it is pinned
+    target: Float[Array, "verts 3"]  # where the vertices go without forces
+    force: Float[Array, "verts 3"] | None  # external, N
+    moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
+
+    @property
+    def frame(self) -> Frame:
+        return Frame(1 / self.simulator.model.fps, body=self.body, blended=self.blended)
+
+
+def _energy(step: Step, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """What a frame minimises, J."""
+    model = step.simulator.model
+    mass = model.material.density * model.garment.mesh.vertex_area
+    terms = replace(model.terms, inertia=False)
+    parts = energies(x, model.garment, model.material, step.frame, terms, model.surface)
+    value = sum(parts.values(), start=jnp.zeros((), x.dtype))
+    if step.force is not None:
+        value = value - _dot(step.force, x)
+    return value + step.moving * inertia(x, step.target, mass, step.frame.dt)
+
+
+def _factored(step: Step, x: Float[Array, "verts 3"]):
+    """A positive definite approximation of the energy's Hessian, factored."""
+    simulator, model = step.simulator, step.simulator.model
+    terms = replace(model.terms, inertia=False)
+    diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, terms, model.surface)
+    # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
+    mass = model.material.density * model.garment.mesh.vertex_area
+    weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / step.frame.dt**2
+    diagonal = diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None]
+    return factorise(simulator.order, diagonal, off)
+
+
+def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
+    """Positions that minimise the energy, found from `start`."""
+    model, frame = step.simulator.model, step.frame
+    mass = model.material.density * model.garment.mesh.vertex_area
+    heavy = jnp.where(mass > 0, mass, 1)
+    dtype = start.dtype
+    tolerance = settings.tolerance
+    if tolerance is None:
+        tolerance = 0.1 if dtype == jnp.float32 else 0.001
+    limit = jnp.where(step.moving > 0, settings.iterations, settings.first)
+
+    def residual(gradient):
+        square = jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / heavy, 0)
+        return jnp.sqrt(jnp.sum(square) / jnp.sum(mass)) / STANDARD_GRAVITY
+
+    def longest(x, p):
+        """The largest step that carries no vertex through the body: as far as its surface, and a little into it."""
+        if model.terms.collision is None:
+            return jnp.ones((), dtype)
+        reach = jnp.maximum(distances(x, frame.body, model.surface, model.terms), 0) * 0.9 + CLEARANCE
+        length = jnp.sqrt(jnp.sum(p * p, axis=-1))
+        return jnp.min(jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(dtype).tiny)))
+
+    value_and_gradient = jax.value_and_grad(lambda x: _energy(step, x))
+
+    def unfinished(state):
+        _, _, _, iteration, status, _ = state
+        return (status < 0) & (iteration < limit)
+
+    def iterate(state):
+        x, value, gradient, iteration, _, _ = state
+        p = -solve(step.simulator.order, _factored(step, x), gradient)
+        slope = _dot(gradient, p)
+        noise = 4 * jnp.finfo(dtype).eps * jnp.abs(value)
+
+        def too_long(search):
+            t, new, _, slope_there = search
+            lower = new <= value + 1e-4 * t * slope
+            # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
+            level = (jnp.abs(new - value) <= noise) & (slope_there <= 0) & (-t * slope <= noise)
+            return ~(lower | level) & (t > LEAST_STEP)
+
+        def at(t):
+            new, there = value_and_gradient(x + t * p)
+            return t, new, there, _dot(there, p)
+
+        first = at(longest(x, p))
+        t, new, there, _ = lax.while_loop(too_long, lambda search: at(search[0] / 2), first)
+        moved = t > LEAST_STEP
+        x = jnp.where(moved, x + t * p, x)
+        value, gradient = jnp.where(moved, new, value), jnp.where(moved, there, gradient)
+        return x, value, gradient, iteration + 1, *judged(value, gradient, ~moved, p)
+
+    def judged(value, gradient, stuck, p):
+        left = residual(gradient)
+        finite = jnp.isfinite(value) & jnp.isfinite(left) & jnp.all(jnp.isfinite(p))
+        status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
+        return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
+
+    value, gradient = value_and_gradient(start)
+    state = (start, value, gradient, jnp.zeros((), jnp.int32), *judged(value, gradient, False, gradient))
+    x, _, _, iterations, status, left = lax.while_loop(unfinished, iterate, state)
+    return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))
+
+
+def _equilibrium(settings: Settings, step: Step, start) -> tuple[Float[Array, "verts 3"], Solution]:
+    """`_minimise`, whose derivative is that of the minimum itself and not of the way to it.
+
+    Where grad E(x, s) = 0, the implicit function theorem gives dx/ds = -H^-1 d(grad E)/ds with the exact Hessian H; in
+    reverse one solve with H for a cotangent, by conjugate gradients that the factored approximation of H preconditions.
+    """
+    leaves, tree = jax.tree.flatten(step)
+    smooth = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves)  # topology has no derivative
+    numbers = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if is_smooth]
+    topology = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if not is_smooth]
+    return _implicit((settings, tree, smooth), numbers, topology, start)
+
+
+def _joined(static, numbers, topology) -> Step:
+    _, tree, smooth = static
+    numbers, topology = iter(numbers), iter(topology)
+    return jax.tree.unflatten(tree, [next(numbers if is_smooth else topology) for is_smooth in smooth])
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _implicit(static, numbers, topology, start):
+    return _minimise(static[0], _joined(static, numbers, topology), start)
+
+
+def _implicit_forward(static, numbers, topology, start):
+    x, solution = _implicit(static, numbers, topology, start)
+    return (x, solution), (numbers, topology, x)
+
+
+def _implicit_backward(static, kept, cotangents):
+    numbers, topology, x = kept
+    along, _ = cotangents
+    step = _joined(static, numbers, topology)
+    gradient = jax.grad(_energy, argnums=1)
+    _, hessian = jax.linearize(lambda x: gradient(step, x), x)
+    factor = _factored(step, x)
+    adjoint = _conjugate_gradients(hessian, lambda r: solve(step.simulator.order, factor, r), along)
+    _, back = jax.vjp(lambda numbers: gradient(_joined(static, numbers, topology), x), numbers)
+    (result,) = back(-adjoint)
+    return result, None, None
+
+
+_implicit.defvjp(_implicit_forward, _implicit_backward)
+
+
+def _conjugate_gradients(matrix: Callable, preconditioner: Callable, right: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """x with matrix(x) = right to nearly the rounding of the type; ends early where the matrix is not positive definite."""
+    tolerance = 1e-6 if right.dtype == jnp.float32 else 1e-12
+    most = 1000
+
+    def unfinished(state):
+        _, r, _, rho, count, definite = state
+        return (jnp.sqrt(_dot(r, r)) > tolerance * jnp.sqrt(_dot(right, right))) & (count < most) & definite & (rho > 0)
+
+    def iterate(state):
+        x, r, p, rho, count, _ = state
+        image = matrix(p)
+        curvature = _dot(p, image)
+        definite = curvature > 0
+        size = jnp.where(definite, rho / jnp.where(definite, curvature, 1), 0)
+        x, r = x + size * p, r - size * image
+        z = preconditioner(r)
+        new = _dot(r, z)
+        return x, r, z + new / rho * p, new, count + 1, definite
+
+    z = preconditioner(right)
+    state = (jnp.zeros_like(right), right, z, _dot(right, z), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    return lax.while_loop(unfinished, iterate, state)[0]
+
+
+def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
+    """A simulation frame by frame: pure functions with explicit state, to be jitted by the caller.
+
+    `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`) and the root's
+    translation (3,) in m, if wanted an external force (verts, 3) in N, and returns the state, whose `solution` tells how the
+    solve went, and the vertices (verts, 3) in m.
+    The first frame is the static state in its pose: before it the character is taken to have stood there.
+    """
+    settings = settings or Settings()
+    model = simulator.model
+    rest = model.garment.mesh.rest
+    dtype = rest.dtype
+
+    def init() -> State:
+        eye = jnp.broadcast_to(jnp.eye(3, 4, dtype=dtype), (len(model.skeleton.parents), 3, 4))
+        nothing = Solution(jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros((), jnp.int32))
+        return State(rest, rest, eye, jnp.asarray(False), nothing)
+
+    def follow(
+        state: State, matrices: Float[Array, "joints 3 4"], force: Float[Array, "verts 3"] | None = None
+    ) -> tuple[State, Float[Array, "verts 3"]]:
+        blended = blend(matrices, model.blend)
+        # The last frame, carried along by skinning, is where the search starts: it goes through no limb, however fast.
+        start = lax.stop_gradient(skin(blended, unpose(blend(state.matrices, model.blend), state.previous)))
+        body = None if model.body is None or model.surface is None else pose_body(model, matrices)
+        moving = state.started.astype(dtype)
+        problem = Step(
+            simulator, body, blended if model.terms.pinning else None, project(state.previous, state.before), force, moving
+        )
+        x, solution = _equilibrium(settings, problem, start)
+        previous = jnp.where(state.started, state.previous, x)
+        return State(x, previous, matrices, jnp.asarray(True), solution), x
+
+    def step(state: State, rotations, translation, force=None):
+        return follow(state, transforms(model.skeleton, forward(model.skeleton, rotations, translation)), force)
+
+    return Simulation(init, step, follow)
+
+
+def simulate(
+    simulator: Simulator, track: Track, settings: Settings | None = None, *, state: State | None = None, forces=None
+) -> tuple[Float[Array, "frames verts 3"], Solution]:
+    """Vertices over one whole motion (frames, verts, 3) in m, and how every frame's solve went.
+
+    Args:
+        simulator: from `simulator_from`. track: of one motion, from `motion.track`. settings: tolerance and iterations.
+        state: to go on from; else the motion begins at rest. forces: external ones (frames, verts, 3) in N.
+
+    It may be differentiated in reverse with respect to the simulator's material and rest state, the track's transforms, the
+    state and the forces: by the implicit function theorem, so memory grows with frames and not with iterations.
+    """
+    simulation = stepper(simulator, settings)
+
+    def frame(state, inputs):
+        state, x = simulation.follow(state, *inputs)
+        return state, (x, state.solution)
+
+    _, result = lax.scan(frame, simulation.init() if state is None else state, (track.matrices, forces))
+    return result

@@ -1,0 +1,165 @@
+"""Second derivatives of the total energy, made positive semi-definite element by element (Teran et al. 2005).
+
+The matrix is one 3x3 block a vertex and one a pair of vertices that share a face or a hinge, as `cholesky` takes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ncs_jax.mesh import Mesh, dihedral
+from ncs_jax.numerics import norm, positive_part
+from ncs_jax.objective import DENSITIES, Frame, Garment, Material, Terms, distances
+
+__all__ = ["Couplings", "couplings_from", "multiply", "stiffness"]
+
+FACE = ((0, 1), (1, 2), (2, 0))
+HINGE = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Couplings:
+    """Which pairs of vertices share an element, and where every element's blocks go.
+
+    Block k couples pairs[k, 0] (rows) with pairs[k, 1] (columns); an element that holds them the other way round adds its
+    block transposed.
+    """
+
+    pairs: Int[Array, "pairs 2"]
+    face_pairs: Int[Array, "3 faces"]
+    face_flips: Bool[Array, "3 faces"]
+    hinge_pairs: Int[Array, "6 hinges"]
+    hinge_flips: Bool[Array, "6 hinges"]
+
+
+def couplings_from(mesh: Mesh) -> Couplings:
+    """All pairs of vertices that a face or a hinge couples."""
+    faces, hinges = np.asarray(mesh.faces), np.asarray(mesh.hinges)
+    of_faces = np.stack([faces[:, p] for p in FACE])
+    of_hinges = np.stack([hinges[:, p] for p in HINGE])
+    every = np.sort(np.concatenate([of_faces.reshape(-1, 2), of_hinges.reshape(-1, 2)]), axis=1)
+    pairs = np.unique(every, axis=0)
+    size = [len(mesh.rest), 1]
+
+    def place(p):
+        index = np.searchsorted(pairs @ size, np.sort(p, axis=-1) @ size)
+        return jnp.asarray(index, jnp.int32), jnp.asarray(p[..., 0] > p[..., 1])
+
+    return Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges))
+
+
+def _membrane(x, mesh: Mesh, density, numbers):
+    """Blocks (3 corners, 3 corners, faces, 3, 3) of the faces' positive semi-definite Hessians."""
+    p = x[mesh.faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    axes = mesh.face_axes
+    w = jnp.stack([e1 * axes[:, 0, i, None] + e2 * axes[:, 1, i, None] for i in (0, 1)])
+    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density(w, *numbers))), w)
+    columns = []
+    for i in range(2):
+        for a in range(3):
+            columns.append(along(jnp.zeros_like(w).at[i, :, a].set(1)).transpose(0, 2, 1).reshape(6, -1))
+    h = positive_part(jnp.stack(columns, axis=1)).reshape(2, 3, 2, 3, -1)
+    h = h * mesh.face_area[None, None, None, None]
+    # w_i = sum_k shape_ki x_k
+    shape = jnp.stack([-axes[:, 0] - axes[:, 1], axes[:, 0], axes[:, 1]])  # (3 corners, faces, 2)
+    blocks = {}
+    for k in range(3):
+        for other in range(3):
+            terms = ((shape[k, :, i] * shape[other, :, j])[None, None] * h[i, :, j] for i in range(2) for j in range(2))
+            blocks[k, other] = jnp.moveaxis(sum(terms), -1, 0)
+    return blocks
+
+
+def _springs(x, mesh: Mesh, stiffness):
+    """The block (edges, 3, 3) of every spring, its pull across taken as zero where it is compressed."""
+    gap = x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]
+    length = norm(gap)
+    safe = jnp.where(length > 0, length, 1)
+    along = gap / safe[:, None]
+    across = jnp.where(length > 0, jnp.maximum(1 - mesh.edge_length / safe, 0), 0)
+    outer = along[:, :, None] * along[:, None, :]
+    eye = jnp.eye(3, dtype=x.dtype)
+    return (stiffness * mesh.edge_weight)[:, None, None] * (across[:, None, None] * (eye[None] - outer) + outer)
+
+
+def _bending(x, mesh: Mesh, stiffness):
+    """Gradients of the angles (hinges, 4, 3) and weights (hinges,): the Gauss-Newton part, which is what is definite."""
+    areas = jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)
+    gradient = jax.grad(lambda h: jnp.sum(dihedral(h, areas)))(x[mesh.hinges])
+    solid = jnp.all(mesh.hinge_area > 0, axis=-1)
+    return gradient, jnp.where(solid, 2 * stiffness * mesh.hinge_length**2 / (8 * jnp.sum(areas, axis=-1)), 0)
+
+
+def stiffness(
+    x: Float[Array, "verts 3"],
+    couplings: Couplings,
+    garment: Garment,
+    material: Material,
+    frame: Frame,
+    terms: Terms,
+    surface=None,
+) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
+    """Blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
+
+    The membrane's element Hessians are projected; springs lose their negative part in closed form; bending and collision
+    enter by the squares of their first derivatives (Gauss-Newton), exact where the angle or distance is at its rest value.
+    """
+    mesh = garment.mesh
+    diagonal = jnp.zeros((*x.shape, 3), x.dtype)
+    off = jnp.zeros((couplings.pairs.shape[0], 3, 3), x.dtype)
+
+    def turned(block, flip):
+        return jnp.where(flip[:, None, None], jnp.swapaxes(block, -1, -2), block)
+
+    if terms.membrane == "mass_spring":
+        block = _springs(x, mesh, *material.membrane)
+        # an edge is a pair of its own: its place is found as that of a face's side
+        place = jnp.searchsorted(
+            couplings.pairs[:, 0] * x.shape[0] + couplings.pairs[:, 1],
+            jnp.min(mesh.edges, axis=1) * x.shape[0] + jnp.max(mesh.edges, axis=1),
+        )
+        diagonal = diagonal.at[mesh.edges].add(block[:, None])
+        off = off.at[place].add(-block)
+    elif terms.membrane is not None:
+        blocks = _membrane(x, mesh, DENSITIES[terms.membrane], material.membrane)
+        diagonal = diagonal.at[mesh.faces.T].add(jnp.stack([blocks[k, k] for k in range(3)]))
+        parts = jnp.stack([turned(blocks[k], couplings.face_flips[i]) for i, k in enumerate(FACE)])
+        off = off.at[couplings.face_pairs].add(parts)
+    if terms.bending:
+        gradient, weight = _bending(x, mesh, material.bending)
+        scaled = gradient * weight[:, None, None]
+        diagonal = diagonal.at[mesh.hinges].add(scaled[..., :, None] * gradient[..., None, :])
+        sides = [scaled[:, k, :, None] * gradient[:, other, None, :] for k, other in HINGE]
+        off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
+    if terms.collision is not None:
+        depth, back = jax.vjp(lambda x: distances(x, frame.body, surface, terms), x)
+        (normal,) = back(jnp.ones_like(depth))
+        active = jnp.where(depth < material.thickness, 2 * material.collision, 0)
+        diagonal = diagonal + active[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    if terms.pinning:
+        pins = garment.pins
+        linear = frame.blended[pins][..., :3]
+        inverse = jnp.linalg.inv(linear)
+        square = jnp.einsum("pia,pib->pab", inverse, inverse, precision="highest")
+        diagonal = diagonal.at[pins].add(2 * material.pinning * square)
+    return diagonal, off
+
+
+def multiply(
+    couplings: Couplings,
+    diagonal: Float[Array, "verts 3 3"],
+    off: Float[Array, "pairs 3 3"],
+    p: Float[Array, "verts 3"],
+) -> Float[Array, "verts 3"]:
+    """The matrix times a field of vectors."""
+    i, j = couplings.pairs.T
+    result = jnp.sum(diagonal * p[:, None, :], axis=-1)
+    result = result.at[i].add(jnp.sum(off * p[j][:, None, :], axis=-1))
+    return result.at[j].add(jnp.sum(off * p[i][:, :, None], axis=-2))

@@ -1,0 +1,116 @@
+"""`ncs simulate`: what it writes, and that stopping it loses nothing."""
+
+import numpy as np
+import pytest
+
+from ncs_jax import InputError, io, simulate, simulation
+from ncs_jax.cli import main
+from ncs_jax.scene import load_scene
+from ncs_jax.simulator import CONVERGED
+
+from .scenes import SCENE, write_scene
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("plain_jax")]
+
+SMOOTH = SCENE.replace("smoothing = 2", 'smoothing = 2\npins = "pins"') + '[physics.collision]\ndistance = "smooth"\n'
+
+
+class StopHere(Exception):
+    pass
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"), SMOOTH)
+
+
+@pytest.fixture(scope="module")
+def unbroken(scene):
+    import jax
+
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        return simulate(scene)
+
+
+def test_every_frame_is_in_balance(unbroken):
+    assert unbroken.vertices.shape == (24, 30, 3)
+    assert unbroken.fps == 30
+    assert np.all(unbroken.status == CONVERGED)
+    assert np.all(unbroken.residual <= 0.1)
+    assert unbroken.iterations.max() > 1
+
+
+def test_stopped_and_continued_is_the_same_bit_for_bit(scene, unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(simulation, "SAVE_EVERY", 0.0)
+    partial = tmp_path / "sim.partial.npz"
+    seen = []
+
+    def stop(progress):
+        seen.append(progress.frame)
+        if progress.frame == 10:
+            raise StopHere
+
+    with pytest.raises(StopHere):
+        simulate(scene, partial=partial, report=stop)
+    again = simulate(scene, partial=partial, report=lambda p: seen.append(p.frame))
+    assert seen == [*range(1, 11), *range(10, 25)]  # the tenth was not saved yet
+    for name in ("vertices", "iterations", "residual", "status"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(unbroken, name))
+
+
+def test_a_partial_file_of_another_simulation_is_refused(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(simulation, "SAVE_EVERY", 0.0)
+    partial = tmp_path / "sim.partial.npz"
+
+    def stop(progress):
+        if progress.frame == 3:
+            raise StopHere
+
+    with pytest.raises(StopHere):
+        simulate(scene, partial=partial, report=stop)
+    other = write_scene(tmp_path, SMOOTH + "stiffness = 20\n")
+    before = partial.read_bytes()
+    with pytest.raises(InputError, match="another simulation"):
+        simulate(other, partial=partial)
+    assert partial.read_bytes() == before
+
+
+def test_substeps_keep_the_frames(scene, unbroken, tmp_path):
+    fine = simulate(write_scene(tmp_path, SMOOTH + "[simulation]\nsubsteps = 2\n"))
+    assert fine.vertices.shape == unbroken.vertices.shape
+    np.testing.assert_allclose(fine.vertices[0], unbroken.vertices[0], atol=5e-3)  # one static state: 0.1 g leave millimetres
+    apart = np.linalg.norm(fine.vertices - unbroken.vertices, axis=-1).max()
+    assert 1e-4 < apart < 0.1  # half the time step: less damping, the same motion
+
+
+def test_the_command_writes_an_animation_that_evaluates(scene, unbroken, tmp_path, capsys):
+    out = tmp_path / "sim.npz"
+    assert main(["simulate", str(scene), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "24 frames at 30 per second" in said
+    assert "residual at most" in said
+    np.testing.assert_array_equal(io.read_animation(out).vertices, unbroken.vertices)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["sim.npz"]
+    motion = str(scene.parent / "swing.npz")
+    assert main(["evaluate", str(out), "--scene", str(scene), "--motion", motion]) == 0
+    assert "out_of_balance" in capsys.readouterr().out
+
+
+def test_frames_off_tolerance_are_told(tmp_path, capsys):
+    scene = write_scene(tmp_path, SMOOTH + "[simulation]\niterations = 1\ntolerance = 1e-3\n")
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "sim.npz")]) == 0
+    assert "not at tolerance: out of iterations" in capsys.readouterr().out
+
+
+def test_broken_input_is_one_line(tmp_path, capsys):
+    assert main(["simulate", str(tmp_path / "none.toml"), "--out", str(tmp_path / "sim.npz")]) == 2
+    scene = write_scene(tmp_path, SMOOTH + "[simulation]\nsubsteps = 0\n")
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "sim.npz")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "simulation.substeps" in lines[1]
+
+
+def test_a_motion_may_be_named(scene, unbroken):
+    again = simulate(load_scene(scene), str(scene.parent / "swing.npz"))
+    np.testing.assert_array_equal(again.vertices, unbroken.vertices)

@@ -1,0 +1,95 @@
+"""Derivatives through the simulator, by the implicit function theorem, against central differences in float64."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.assembly import assemble, track_of
+from ncs_jax.scene import load_scene
+from ncs_jax.simulator import CONVERGED, Settings, simulate, simulator_from
+
+from .scenes import SCENE, write_scene
+
+pytestmark = pytest.mark.slow
+
+TIGHT = Settings(tolerance=1e-10, iterations=200, first=5000)
+FREE = SCENE.replace("body.npz", "none").replace('files = ["swing.npz"]\nvalidation = ["swing.npz"]', "files = []")
+PINNED = "[physics]\ngravity = [0.4, -9.81, 1.0]\n[physics.pinning]\nstiffness = 50\n"
+
+
+def scene(tmp_path, contact):
+    text = (SCENE if contact else FREE).replace("smoothing = 2", 'smoothing = 2\npins = "pins"') + PINNED
+    text = text.replace("modes = 6", "modes = 0")
+    if contact:
+        text += '[physics.collision]\ndistance = "smooth"\nstiffness = 40\nthickness = 0.006\n'
+    assembly = assemble(load_scene(write_scene(tmp_path, text)), dtype=jnp.float64)
+    model = assembly.model
+    if contact:
+        track = track_of(model, assembly.motions["swing.npz"])
+        return simulator_from(model), jax.tree.map(lambda a: a[:5], track)
+    track = assembly.track  # a character that never moves is one frame long
+    return simulator_from(replace(model, moves=True)), jax.tree.map(lambda a: jnp.repeat(a, 5, axis=0), track)
+
+
+def outcome(simulator, track, forces, wanted):
+    x, solution = simulate(simulator, track, TIGHT, forces=forces)
+    return jnp.sum(wanted * x[1:]), solution
+
+
+def perturbed(simulator, track, forces, name, size, direction):
+    """The same problem with one of its inputs moved by `size` times `direction`."""
+    if name == "forces":
+        return simulator, track, forces + size * direction
+    if name == "body motion":
+        return simulator, replace(track, matrices=track.matrices + size * direction), forces
+    if name == "pins":
+        garment = simulator.model.garment
+        mesh = replace(garment.mesh, rest=garment.mesh.rest + size * direction)
+        return replace(simulator, model=replace(simulator.model, garment=replace(garment, mesh=mesh))), track, forces
+    material = simulator.model.material
+    if name == "lam":
+        changed = replace(material, membrane=(material.membrane[0] * (1 + size), material.membrane[1]))
+    else:
+        changed = replace(material, **{name: getattr(material, name) * (1 + size)})
+    return replace(simulator, model=replace(simulator.model, material=changed)), track, forces
+
+
+@pytest.mark.parametrize("contact", [False, True], ids=["hanging", "on the post"])
+def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, contact):
+    simulator, track = scene(tmp_path, contact)
+    shape = (5, *simulator.model.garment.mesh.rest.shape)
+    wanted = jnp.asarray(rng.standard_normal((4, *shape[1:])))
+    forces = jnp.asarray(1e-4 * rng.standard_normal(shape))
+    directions = {
+        "density": jnp.ones(()),
+        "lam": jnp.ones(()),
+        "bending": jnp.ones(()),
+        "pinning": jnp.ones(()),
+        "gravity": jnp.ones(()),
+        "forces": jnp.asarray(1e-4 * rng.standard_normal(shape)),
+        "pins": jnp.zeros(shape[1:]).at[25:].set(0.01 * rng.standard_normal((5, 3))),
+    }
+    if contact:
+        directions |= {"collision": jnp.ones(()), "thickness": jnp.ones(())}
+        directions["body motion"] = jnp.asarray(0.01 * rng.standard_normal(track.matrices.shape))
+
+    @jax.jit
+    def moved(sizes):
+        problem = simulator, track, forces
+        for (name, direction), size in zip(directions.items(), sizes, strict=True):
+            problem = perturbed(*problem, name, size, direction)
+        return outcome(*problem, wanted)
+
+    here = jnp.zeros(len(directions))
+    gradient, solution = jax.jit(jax.grad(moved, has_aux=True))(here)
+    assert np.all(np.asarray(solution.status) == CONVERGED)
+    for k, name in enumerate(directions):
+        step = 1e-4
+        ends = [moved(here.at[k].set(sign * step)) for sign in (1, -1)]
+        assert all(np.all(np.asarray(s.status) == CONVERGED) for _, s in ends)
+        difference = float(ends[0][0] - ends[1][0]) / (2 * step)
+        assert abs(difference) > 1e-7, f"{name} changes nothing"
+        np.testing.assert_allclose(float(gradient[k]), difference, rtol=1e-4, err_msg=name)
