@@ -33,7 +33,7 @@ class Group:
     border: Int[Array, "fronts border"]
     blocks: Int[Array, "entries"]  # off-diagonal blocks that enter here
     places: Int[Array, "entries 3"]  # where: front, row, column
-    flipped: Int[Array, "entries"]  # 1: the block enters transposed
+    flipped: Int[Array, "entries"]  # 1: the block couples them the other way round
     children: Int[Array, "fronts 2 local"] | None  # row in the updates of the depth below that a local row takes
     columns: Int[Array, "fronts 2 local"] | None  # and its place among the columns of that update
 
@@ -236,7 +236,7 @@ def _triple(index: Array) -> Array:
 def factorise(order: Elimination, diagonal: Float[Array, "verts 3 3"], off: Float[Array, "pairs 3 3"]) -> Factor:
     """Factor a symmetric positive definite matrix; NaN where it is not."""
     dtype = diagonal.dtype
-    inverses, rows = [], []
+    inverses, borders = [], []
     updates = None
     token = jnp.zeros((), dtype)
     padded = jnp.concatenate([diagonal, jnp.eye(3, dtype=dtype)[None]])
@@ -248,49 +248,48 @@ def factorise(order: Elimination, diagonal: Float[Array, "verts 3 3"], off: Floa
         for group in level:
             fronts, p = group.pivots.shape
             b = group.border.shape[1]
-            front = jnp.zeros((fronts, 3 * (p + b), 3 * (p + b)), dtype) if updates is None else _taken(group, updates)
-            corner = front[:, 3 * p :, 3 * p :]
             # One group after the other: LAPACK, called from two threads at once, hangs XLA's CPU client (jaxlib 0.10).
-            front = _entered(group, front[:, :, : 3 * p], padded + 0 * token, off)
-            lower = jnp.linalg.cholesky(front[:, : 3 * p], symmetrize_input=False)
+            rows = _entered(group, None if updates is None else _taken(group, updates, 0, p, 0), padded + 0 * token, off)
+            # LAPACK reads by columns: of a symmetric matrix the transpose is the same one without a copy.
+            lower = jnp.linalg.cholesky(jnp.swapaxes(rows[:, :, : 3 * p], 1, 2), symmetrize_input=False)
             eye = jnp.broadcast_to(jnp.eye(3 * p, dtype=dtype), lower.shape)
             inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-            row = jnp.einsum("fij,fbj->fib", inverse, front[:, 3 * p :], precision="highest")
+            row = jnp.einsum("fij,fjb->fib", inverse, rows[:, :, 3 * p :], precision="highest")
             inverses.append(inverse)
-            rows.append(row)
+            borders.append(row)
             if b:
                 token = row[0, 0, 0] if p else token
-                update = corner - jnp.einsum("fpa,fpb->fab", row, row, precision="highest")
+                update = -jnp.einsum("fpa,fpb->fab", row, row, precision="highest")
+                if updates is not None:
+                    update = _taken(group, updates, p, p + b, p) + update
                 left = lax.dynamic_update_slice(left, update, (first, 0, 0))
             first += fronts
         updates = lax.optimization_barrier(left)
-    return Factor(tuple(inverses), tuple(rows))
+    return Factor(tuple(inverses), tuple(borders))
 
 
-def _entered(group: Group, front, diagonal, off):
-    """Add the blocks of the matrix that enter at a group's fronts (fronts, 3 local, 3 pivots)."""
+def _entered(group: Group, rows, diagonal, off):
+    """Add the blocks of the matrix that enter at a group's fronts to the rows of their pivots, (fronts, 3 pivots, 3 local)."""
     fronts, p = group.pivots.shape
     m = p + group.border.shape[1]
-    front = front.reshape(fronts, m, 3, p, 3)
+    rows = (jnp.zeros((fronts, 3 * p, 3 * m), off.dtype) if rows is None else rows).reshape(fronts, p, 3, m, 3)
     if group.blocks.shape[0]:
         blocks = off[group.blocks]
-        blocks = jnp.where(group.flipped[:, None, None] == 1, jnp.swapaxes(blocks, -1, -2), blocks)
-        f, i, j = group.places.T
-        front = front.at[f, i, :, j, :].add(blocks, mode="promise_in_bounds", unique_indices=True)
+        blocks = jnp.where(group.flipped[:, None, None] == 1, blocks, jnp.swapaxes(blocks, -1, -2))
+        f, late, early = group.places.T
+        rows = rows.at[f, early, :, late, :].add(blocks, mode="promise_in_bounds", unique_indices=True)
     k = jnp.arange(p)
-    front = front.at[:, k, :, k, :].add(jnp.moveaxis(diagonal[group.pivots], 1, 0), unique_indices=True)
-    return front.reshape(fronts, 3 * m, 3 * p)
+    rows = rows.at[:, k, :, k, :].add(jnp.moveaxis(diagonal[group.pivots], 1, 0), unique_indices=True)
+    return rows.reshape(fronts, 3 * p, 3 * m)
 
 
-def _taken(group: Group, updates):
-    """The sum of what the two children of every front leave to it, in its own order: (fronts, 3 local, 3 local)."""
-    fronts, _, m = group.children.shape
+def _taken(group: Group, updates, top, bottom, left):
+    """The sum of what the two children of every front leave to its rows from `top` to `bottom`, its columns from `left` on."""
     size = updates.shape[-1]
-    rows = _triple(group.children.reshape(2 * fronts, m))
-    rows = lax.optimization_barrier(updates.reshape(-1, size).at[rows].get(mode="promise_in_bounds"))
-    columns = _triple(group.columns.reshape(2 * fronts, m))
-    taken = lax.optimization_barrier(jnp.take_along_axis(rows, columns[:, None, :], axis=2))
-    taken = taken.reshape(fronts, 2, 3 * m, 3 * m)
+    rows = _triple(group.children[:, :, top:bottom])
+    columns = _triple(group.columns[:, :, left:])
+    taken = updates.reshape(-1).at[rows[..., :, None] * size + columns[..., None, :]].get(mode="promise_in_bounds")
+    taken = lax.optimization_barrier(taken)
     return taken[:, 0] + taken[:, 1]
 
 
