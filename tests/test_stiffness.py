@@ -43,7 +43,15 @@ def garment(shape, dtype=jnp.float64, seed=None):
 
 @partial(jax.jit, static_argnames="terms", compiler_options=QUICK)
 def blocks(x, couplings, cloth, numbers, frame, terms, surface=None):
-    return stiffness(x, couplings, cloth, numbers, frame, terms, surface)
+    return stiffness(x, couplings, cloth, numbers, frame, terms, touching(x, frame, surface, terms))
+
+
+def touching(x, frame, surface, terms):
+    """Distances and their derivatives."""
+    if terms.collision is None:
+        return None
+    depth, back = jax.vjp(lambda x: distances(x, frame.body, surface, terms), x)
+    return depth, *back(jnp.ones_like(depth))
 
 
 @partial(jax.jit, static_argnames="terms", compiler_options=QUICK)
@@ -255,7 +263,8 @@ def read(terms):
     cloth, couplings = garment("sheet")
     numbers = material(terms.membrane)
     names = [f.name for f in dataclasses.fields(numbers) for _ in jax.tree.leaves(getattr(numbers, f.name))]
-    traced = jax.make_jaxpr(lambda n: stiffness(x, couplings, cloth, n, frame, terms, surface))(numbers).jaxpr
+    contact = touching(x, frame, surface, terms)
+    traced = jax.make_jaxpr(lambda n: stiffness(x, couplings, cloth, n, frame, terms, contact))(numbers).jaxpr
     used = {id(v) for equation in traced.eqns for v in equation.invars}
     return {name for name, v in zip(names, traced.invars, strict=True) if id(v) in used}
 

@@ -103,7 +103,7 @@ def simulate(
         "status": np.zeros(0, np.int64),
     }
     if partial is not None and Path(partial).exists():
-        done, state = _continued(Path(partial), identity, done, matrices, spec.substeps)
+        done, state = _continued(Path(partial), identity, done, state)
     rows: dict[str, list] = {key: list(values) for key, values in done.items()}
     begun = saved = time.monotonic()
     first = len(rows["status"])
@@ -122,28 +122,27 @@ def simulate(
             report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
         if partial is not None and now - saved > SAVE_EVERY and t + 1 < frames:
             arrays = {key: np.asarray(values) for key, values in rows.items()}
-            write_npz(partial, before=np.asarray(state.before), identity=np.asarray(identity), **arrays)
+            write_npz(partial, **_kept(state), identity=np.asarray(identity), **arrays)
             saved = time.monotonic()
     arrays = {key: np.asarray(values) for key, values in rows.items()}
     return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
 
 
-def _continued(partial: Path, identity: str, like: dict[str, np.ndarray], matrices, substeps: int):
+KEPT = ("previous", "before", "unposed", "unposed_before")  # the state, beside how the last solve went
+
+
+def _kept(state: State) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(state, name)) for name in KEPT}
+
+
+def _continued(partial: Path, identity: str, like: dict[str, np.ndarray], start: State):
     """The frames that are done, and the state to go on from."""
-    table = read_npz(partial, {*like, "before", "identity"}.__contains__)
+    table = read_npz(partial, {*like, *KEPT, "identity"}.__contains__)
     if str(table.array("identity")) != identity:
         raise InputError(
             "the same scene and motion expected", file=partial, field="identity", value="another simulation's",
             mend="delete this file to begin anew",
         )  # fmt: skip
     done = {key: np.asarray(table.array(key), values.dtype) for key, values in like.items()}
-    last = len(done["status"]) - 1
-    nothing = Solution(jnp.zeros((), jnp.int32), jnp.zeros((), matrices.dtype), jnp.zeros((), jnp.int32))
-    state = State(
-        jnp.asarray(done["vertices"][last]),
-        jnp.asarray(table.array("before")),
-        matrices[last * substeps],
-        jnp.asarray(True),
-        nothing,
-    )
-    return done, state
+    previous, before, unposed, unposed_before = (jnp.asarray(table.array(name)) for name in KEPT)
+    return done, State(previous, before, unposed, unposed_before, jnp.asarray(True), start.solution)

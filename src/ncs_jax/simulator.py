@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.cholesky import Elimination, elimination, factorise, solve
+from ncs_jax.energies.collision import collision
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
 from ncs_jax.model import Model, pose_body
@@ -73,11 +74,12 @@ class Solution:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:
-    """What goes from frame to frame: the two last positions, the joints' transforms of the last, how its solve went."""
+    """What goes from frame to frame: the two last positions, the same two unposed, how the last solve went."""
 
     previous: Float[Array, "verts 3"]
     before: Float[Array, "verts 3"]
-    matrices: Float[Array, "joints 3 4"]
+    unposed: Float[Array, "verts 3"]
+    unposed_before: Float[Array, "verts 3"]
     started: Bool[Array, ""]
     solution: Solution
 
@@ -117,11 +119,11 @@ class Step:
         return Frame(1 / self.simulator.model.fps, body=self.body, blended=self.blended)
 
 
-def _energy(step: Step, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
-    """What a frame minimises, J."""
+def _energy(step: Step, x: Float[Array, "verts 3"], **without) -> Float[Array, ""]:
+    """What a frame minimises, J; perhaps without some of its terms."""
     model = step.simulator.model
     mass = model.material.density * model.garment.mesh.vertex_area
-    terms = replace(model.terms, inertia=False)
+    terms = replace(model.terms, inertia=False, **without)
     parts = energies(x, model.garment, model.material, step.frame, terms, model.surface)
     value = sum(parts.values(), start=jnp.zeros((), x.dtype))
     if step.force is not None:
@@ -129,11 +131,31 @@ def _energy(step: Step, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
     return value + step.moving * inertia(x, step.target, mass, step.frame.dt)
 
 
-def _factored(step: Step, x: Float[Array, "verts 3"]):
+def _touching(step: Step, x: Float[Array, "verts 3"]):
+    """Distances (verts,) to the body and their derivatives (verts, 3): a vertex's distance depends on it alone."""
+    model = step.simulator.model
+    if model.terms.collision is None:
+        return None
+    depth, back = jax.vjp(lambda x: distances(x, step.body, model.surface, model.terms), x)
+    return depth, *back(jnp.ones_like(depth))
+
+
+def _evaluated(step: Step, x: Float[Array, "verts 3"]):
+    """Energy, gradient and what is touched; the body is looked at once for all three."""
+    model = step.simulator.model
+    value, gradient = jax.value_and_grad(lambda x: _energy(step, x, collision=None))(x)
+    contact = _touching(step, x)
+    if contact is not None:
+        depth, normal = contact
+        push, slope = jax.value_and_grad(collision)(depth, model.material.thickness, model.material.collision)
+        value, gradient = value + push, gradient + slope[:, None] * normal
+    return value, gradient, contact
+
+
+def _factored(step: Step, x: Float[Array, "verts 3"], contact):
     """A positive definite approximation of the energy's Hessian, factored."""
     simulator, model = step.simulator, step.simulator.model
-    terms = replace(model.terms, inertia=False)
-    diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, terms, model.surface)
+    diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, model.terms, contact)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
     mass = model.material.density * model.garment.mesh.vertex_area
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / step.frame.dt**2
@@ -143,7 +165,7 @@ def _factored(step: Step, x: Float[Array, "verts 3"]):
 
 def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
     """Positions that minimise the energy, found from `start`."""
-    model, frame = step.simulator.model, step.frame
+    model = step.simulator.model
     mass = model.material.density * model.garment.mesh.vertex_area
     heavy = jnp.where(mass > 0, mass, 1)
     dtype = start.dtype
@@ -156,54 +178,53 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
         square = jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / heavy, 0)
         return jnp.sqrt(jnp.sum(square) / jnp.sum(mass)) / STANDARD_GRAVITY
 
-    def longest(x, p):
-        """The largest step that carries no vertex through the body: as far as its surface, and a little into it."""
-        if model.terms.collision is None:
-            return jnp.ones((), dtype)
-        reach = jnp.maximum(distances(x, frame.body, model.surface, model.terms), 0) * 0.9 + CLEARANCE
-        length = jnp.sqrt(jnp.sum(p * p, axis=-1))
-        return jnp.min(jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(dtype).tiny)))
-
-    value_and_gradient = jax.value_and_grad(lambda x: _energy(step, x))
-
     def unfinished(state):
-        _, _, _, iteration, status, _ = state
+        _, _, iteration, status, _ = state
         return (status < 0) & (iteration < limit)
 
     def iterate(state):
-        x, value, gradient, iteration, _, _ = state
-        p = -solve(step.simulator.order, _factored(step, x), gradient)
+        x, point, iteration, _, _ = state
+        value, gradient, contact = point
+        p = -solve(step.simulator.order, _factored(step, x, contact), gradient)
         slope = _dot(gradient, p)
         noise = 4 * jnp.finfo(dtype).eps * jnp.abs(value)
 
         def too_long(search):
-            t, new, _, slope_there = search
+            t, (new, there, _) = search
             lower = new <= value + 1e-4 * t * slope
             # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
-            level = (jnp.abs(new - value) <= noise) & (slope_there <= 0) & (-t * slope <= noise)
+            level = (jnp.abs(new - value) <= noise) & (_dot(there, p) <= 0) & (-t * slope <= noise)
             return ~(lower | level) & (t > LEAST_STEP)
 
         def at(t):
-            new, there = value_and_gradient(x + t * p)
-            return t, new, there, _dot(there, p)
+            return t, _evaluated(step, x + t * p)
 
-        first = at(longest(x, p))
-        t, new, there, _ = lax.while_loop(too_long, lambda search: at(search[0] / 2), first)
+        t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(jnp.min(_unhindered(contact, p))))
         moved = t > LEAST_STEP
         x = jnp.where(moved, x + t * p, x)
-        value, gradient = jnp.where(moved, new, value), jnp.where(moved, there, gradient)
-        return x, value, gradient, iteration + 1, *judged(value, gradient, ~moved, p)
+        point = jax.tree.map(functools.partial(jnp.where, moved), new, point)
+        return x, point, iteration + 1, *judged(point, ~moved, p)
 
-    def judged(value, gradient, stuck, p):
+    def judged(point, stuck, p):
+        value, gradient, _ = point
         left = residual(gradient)
         finite = jnp.isfinite(value) & jnp.isfinite(left) & jnp.all(jnp.isfinite(p))
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    value, gradient = value_and_gradient(start)
-    state = (start, value, gradient, jnp.zeros((), jnp.int32), *judged(value, gradient, False, gradient))
-    x, _, _, iterations, status, left = lax.while_loop(unfinished, iterate, state)
+    point = _evaluated(step, start)
+    state = (start, point, jnp.zeros((), jnp.int32), *judged(point, False, start))
+    x, _, iterations, status, left = lax.while_loop(unfinished, iterate, state)
     return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))
+
+
+def _unhindered(contact, p: Float[Array, "verts 3"]):
+    """The share of a vertex's way p that does not carry it through the body: to the surface, and a little into it."""
+    if contact is None:
+        return jnp.ones((), p.dtype)
+    reach = jnp.maximum(contact[0], 0) * 0.9 + CLEARANCE
+    length = jnp.sqrt(jnp.sum(p * p, axis=-1))
+    return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
 
 
 def _equilibrium(settings: Settings, step: Step, start) -> tuple[Float[Array, "verts 3"], Solution]:
@@ -241,7 +262,7 @@ def _implicit_backward(static, kept, cotangents):
     step = _joined(static, numbers, topology)
     gradient = jax.grad(_energy, argnums=1)
     _, hessian = jax.linearize(lambda x: gradient(step, x), x)
-    factor = _factored(step, x)
+    factor = _factored(step, x, _touching(step, x))
     adjoint = _conjugate_gradients(hessian, lambda r: solve(step.simulator.order, factor, r), along)
     _, back = jax.vjp(lambda numbers: gradient(_joined(static, numbers, topology), x), numbers)
     (result,) = back(-adjoint)
@@ -276,6 +297,13 @@ def _conjugate_gradients(matrix: Callable, preconditioner: Callable, right: Floa
     return lax.while_loop(unfinished, iterate, state)[0]
 
 
+def _expected(step: Step, state: State, blended: Float[Array, "verts 3 4"]) -> Float[Array, "verts 3"]:
+    """Where a frame's search starts: the last frame goes on as it moves in unposed space, but through no limb, however fast."""
+    carried = skin(blended, state.unposed)
+    onward = skin(blended, 2 * state.unposed - state.unposed_before) - carried
+    return carried + jnp.atleast_1d(_unhindered(_touching(step, carried), onward))[:, None] * onward
+
+
 def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
     """A simulation frame by frame: pure functions with explicit state, to be jitted by the caller.
 
@@ -290,24 +318,24 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
     dtype = rest.dtype
 
     def init() -> State:
-        eye = jnp.broadcast_to(jnp.eye(3, 4, dtype=dtype), (len(model.skeleton.parents), 3, 4))
         nothing = Solution(jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros((), jnp.int32))
-        return State(rest, rest, eye, jnp.asarray(False), nothing)
+        return State(rest, rest, rest, rest, jnp.asarray(False), nothing)
 
     def follow(
         state: State, matrices: Float[Array, "joints 3 4"], force: Float[Array, "verts 3"] | None = None
     ) -> tuple[State, Float[Array, "verts 3"]]:
         blended = blend(matrices, model.blend)
-        # The last frame, carried along by skinning, is where the search starts: it goes through no limb, however fast.
-        start = lax.stop_gradient(skin(blended, unpose(blend(state.matrices, model.blend), state.previous)))
         body = None if model.body is None or model.surface is None else pose_body(model, matrices)
-        moving = state.started.astype(dtype)
+        moving = state.started & model.terms.inertia
         problem = Step(
-            simulator, body, blended if model.terms.pinning else None, project(state.previous, state.before), force, moving
-        )
-        x, solution = _equilibrium(settings, problem, start)
-        previous = jnp.where(state.started, state.previous, x)
-        return State(x, previous, matrices, jnp.asarray(True), solution), x
+            simulator, body, blended if model.terms.pinning else None, project(state.previous, state.before), force,
+            moving.astype(dtype),
+        )  # fmt: skip
+        x, solution = _equilibrium(settings, problem, lax.stop_gradient(_expected(problem, state, blended)))
+        unposed = unpose(blended, x)
+        first = ~state.started
+        before = (jnp.where(first, x, state.previous), jnp.where(first, unposed, state.unposed))
+        return State(x, before[0], unposed, before[1], jnp.asarray(True), solution), x
 
     def step(state: State, rotations, translation, force=None):
         return follow(state, transforms(model.skeleton, forward(model.skeleton, rotations, translation)), force)

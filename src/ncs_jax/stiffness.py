@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.membrane import deformation
 from ncs_jax.mesh import Mesh, dihedral
-from ncs_jax.numerics import norm, positive_part
-from ncs_jax.objective import DENSITIES, Frame, Garment, Material, Terms, distances
+from ncs_jax.numerics import norm, normalize, positive_part
+from ncs_jax.objective import DENSITIES, Frame, Garment, Material, Terms
 
 __all__ = ["Couplings", "couplings_from", "multiply", "stiffness"]
 
@@ -55,26 +56,55 @@ def couplings_from(mesh: Mesh) -> Couplings:
 
 
 def _membrane(x, mesh: Mesh, density, numbers):
-    """Blocks (3 corners, 3 corners, faces, 3, 3) of the faces' positive semi-definite Hessians."""
-    p = x[mesh.faces]
-    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    axes = mesh.face_axes
-    w = jnp.stack([e1 * axes[:, 0, i, None] + e2 * axes[:, 1, i, None] for i in (0, 1)])
-    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density(w, *numbers))), w)
-    columns = []
-    for i in range(2):
-        for a in range(3):
-            columns.append(along(jnp.zeros_like(w).at[i, :, a].set(1)).transpose(0, 2, 1).reshape(6, -1))
-    h = positive_part(jnp.stack(columns, axis=1)).reshape(2, 3, 2, 3, -1)
-    h = h * mesh.face_area[None, None, None, None]
-    # w_i = sum_k shape_ki x_k
-    shape = jnp.stack([-axes[:, 0] - axes[:, 1], axes[:, 0], axes[:, 1]])  # (3 corners, faces, 2)
+    """Blocks (3 corners, 3 corners, faces, 3, 3) of the faces' Hessians, each made positive semi-definite.
+
+    A density depends on lengths and angles only, so seen in the face's own frame (t, s, n) its Hessian has two parts: that of
+    the material within the plane, 4x4, and the stress, 2x2, which acts alike on all three axes. Each loses its negative part.
+    """
+    w = deformation(x, mesh)
+    t, s = _plane(w)
+    zero = jnp.zeros_like(w[..., 0])
+    flat = jnp.stack([jnp.sum(w * t[None], axis=-1), jnp.sum(w * s[None], axis=-1), zero], axis=-1)
+    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density(w, *numbers))), flat)
+
+    def column(i, a):
+        return along(jnp.zeros_like(flat).at[i, :, a].set(1))
+
+    out = [column(j, 2) for j in range(2)]
+    stress = jnp.stack([jnp.stack([out[j][i, :, 2] for j in range(2)]) for i in range(2)])
+    inner = jnp.stack([column(j, b)[:, :, a] for j in range(2) for b in range(2) for a in range(2)])
+    inner = inner.reshape(2, 2, 2, 2, -1).transpose(3, 2, 0, 1, 4)  # (i, a, j, b, faces)
+    inner = inner - stress[:, None, :, None] * jnp.eye(2, dtype=x.dtype)[None, :, None, :, None]
+    material = positive_part(inner.reshape(4, 4, -1)).reshape(2, 2, 2, 2, -1)
+    pull = positive_part(stress)
+    area = mesh.face_area
+    axes = jnp.stack([t, s])
+    eye = jnp.eye(3, dtype=x.dtype)
+    shape = jnp.stack([-mesh.face_axes[:, 0] - mesh.face_axes[:, 1], mesh.face_axes[:, 0], mesh.face_axes[:, 1]])
     blocks = {}
     for k in range(3):
         for other in range(3):
-            terms = ((shape[k, :, i] * shape[other, :, j])[None, None] * h[i, :, j] for i in range(2) for j in range(2))
-            blocks[k, other] = jnp.moveaxis(sum(terms), -1, 0)
+            # w_i = sum_k shape_ki x_k
+            weight = {(i, j): area * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
+            even = sum((weight[i, j] * pull[i, j] for i, j in weight), start=jnp.zeros_like(area))
+            block = even[:, None, None] * eye[None]
+            for a in range(2):
+                for b in range(2):
+                    within = sum((weight[i, j] * material[i, a, j, b] for i, j in weight), start=jnp.zeros_like(area))
+                    block = block + within[:, None, None] * axes[a, :, :, None] * axes[b, :, None, :]
+            blocks[k, other] = block
     return blocks
+
+
+def _plane(w):
+    """Two orthogonal unit vectors (faces, 3) in the plane of every face; any two where it is collapsed."""
+    longer = jnp.sum(w[0] * w[0], axis=-1) >= jnp.sum(w[1] * w[1], axis=-1)
+    t = normalize(jnp.where(longer[:, None], w[0], w[1]))
+    t = jnp.where(jnp.any(t != 0, axis=-1, keepdims=True), t, jnp.eye(3, dtype=w.dtype)[0])
+    n = normalize(jnp.cross(w[0], w[1]))
+    least = jnp.eye(3, dtype=w.dtype)[jnp.argmin(jnp.abs(t), axis=-1)]
+    n = jnp.where(jnp.any(n != 0, axis=-1, keepdims=True), n, normalize(jnp.cross(t, least)))
+    return t, normalize(jnp.cross(n, t))
 
 
 def _springs(x, mesh: Mesh, stiffness):
@@ -104,9 +134,11 @@ def stiffness(
     material: Material,
     frame: Frame,
     terms: Terms,
-    surface=None,
+    contact: tuple[Float[Array, "verts"], Float[Array, "verts 3"]] | None = None,
 ) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
     """Blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
+
+    contact: distances (verts,) to the body and their derivatives (verts, 3), where there is collision.
 
     The membrane's element Hessians are projected; springs lose their negative part in closed form; bending and collision
     enter by the squares of their first derivatives (Gauss-Newton), exact where the angle or distance is at its rest value.
@@ -139,8 +171,7 @@ def stiffness(
         sides = [scaled[:, k, :, None] * gradient[:, other, None, :] for k, other in HINGE]
         off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
     if terms.collision is not None:
-        depth, back = jax.vjp(lambda x: distances(x, frame.body, surface, terms), x)
-        (normal,) = back(jnp.ones_like(depth))
+        depth, normal = contact
         active = jnp.where(depth < material.thickness, 2 * material.collision, 0)
         diagonal = diagonal + active[:, None, None] * normal[:, :, None] * normal[:, None, :]
     if terms.pinning:

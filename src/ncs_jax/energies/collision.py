@@ -6,6 +6,7 @@ integers and carries no derivative. The *distance* is then a smooth function of 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import jax
@@ -290,21 +291,22 @@ def smooth_distance(
     first = jnp.concatenate([jnp.ones_like(blocks[:, :1]), (blocks[:, 1:] != blocks[:, :-1]).astype(blocks.dtype)], axis=1)
     width = surface.spacing.astype(x.dtype) ** 2
 
-    @jax.checkpoint
     def group(args):
         points, chosen = args
         names = blocks[chosen].reshape(-1)
-        at, n = body[names], normals[names]
-        once = first[chosen].reshape(-1) == 1  # a short block repeats its last vertex
-        gap = [points[:, None, i] - at[None, :, i] for i in range(3)]
-        square = sum(g * g for g in gap)
-        square = jnp.where(once, square, jnp.inf)
+        centre = lax.stop_gradient(jnp.mean(points, axis=0, keepdims=True))  # near it no product below cancels
+        at, n, points = body[names] - centre, normals[names], points - centre
+        product = functools.partial(jnp.matmul, precision="highest")
+        square = jnp.sum(at * at, axis=1)[None] - 2 * product(points, at.T)  # less |x|^2, which no weight depends on
         nearest = lax.stop_gradient(square.min(axis=1, keepdims=True))
-        weight = jnp.where(once, jnp.exp((nearest - jnp.where(once, square, 0)) / width), 0)
-        height = sum(g * n[None, :, i] for i, g in enumerate(gap))
-        return jnp.sum(weight * height, axis=1) / jnp.sum(weight, axis=1)
+        weight = jnp.exp((nearest - square) / width)
+        columns = jnp.stack([jnp.ones_like(n[:, 0]), *n.T, jnp.sum(n * at, axis=1)], axis=1)
+        sums = product(
+            weight, jnp.where(first[chosen].reshape(-1, 1) == 1, columns, 0)
+        )  # a short block repeats its last vertex
+        return (jnp.sum(sums[:, 1:4] * points, axis=1) - sums[:, 4]) / sums[:, 0]
 
-    distance = lax.map(group, (cloth, chosen), batch_size=8)
+    distance = lax.map(group, (cloth, chosen), batch_size=16)
     return distance.reshape(-1)[surface.cloth_place]
 
 
