@@ -99,16 +99,21 @@ class Frame:
 
 
 def distances(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms
+    x: Float[Array, "verts 3"],
+    body: Float[Array, "body 3"],
+    surface: Surface,
+    terms: Terms,
+    normals: Float[Array, "body 3"] | None = None,
 ) -> Float[Array, "verts"]:
-    """Signed distance to the posed body in m by the scene's query."""
+    """Signed distance to the posed body in m by the scene's query; `normals`: of the body's vertices, where known."""
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
         return triangle_distance(x, body, surface, index)
+    normals = vertex_normals(body, surface) if normals is None else normals
     if terms.collision == "smooth":
-        return smooth_distance(x, body, vertex_normals(body, surface), surface)
+        return smooth_distance(x, body, normals, surface)
     index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
-    return plane_distance(x, body, vertex_normals(body, surface), index)
+    return plane_distance(x, body, normals, index)
 
 
 def energies(

@@ -20,12 +20,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.cholesky import Elimination, elimination, factorise, solve
-from ncs_jax.energies.collision import collision
+from ncs_jax.energies.collision import collision, smooth_distance, vertex_normals
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.patch import SIZE, patch_around, solve_dense
 from ncs_jax.stiffness import Couplings, couplings_from, stiffness
 
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Simulation", "Simulator", "Solution", "simulate",
@@ -36,6 +37,8 @@ STANDARD_GRAVITY = 9.81  # m/s^2, the unit of residuals
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
 LEAST_STEP = 1e-6  # of a Newton step: below it the line search gives up
+SHARE = 0.5  # of the imbalance that a patch must hold to be worth a solve of its own
+LOCAL = 20  # steps of a patch
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,8 @@ class Step:
     target: Float[Array, "verts 3"]  # where the vertices go without forces
     force: Float[Array, "verts 3"] | None  # external, N
     moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
+    normals: Float[Array, "body 3"] | None = None  # of the body, where they are found once a frame
+    only: Int[Array, "some"] | None = None  # the vertices whose contact changes, if not all
 
     @property
     def frame(self) -> Frame:
@@ -136,8 +141,11 @@ def _touching(step: Step, x: Float[Array, "verts 3"]):
     model = step.simulator.model
     if model.terms.collision is None:
         return None
-    depth, back = jax.vjp(lambda x: distances(x, step.body, model.surface, model.terms), x)
-    return depth, *back(jnp.ones_like(depth))
+    if step.only is None:
+        depth, back = jax.vjp(lambda x: distances(x, step.body, model.surface, model.terms, step.normals), x)
+        return depth, *back(jnp.ones_like(depth))
+    some, back = jax.vjp(lambda x: smooth_distance(x, step.body, step.normals, model.surface, step.only), x)
+    return jnp.full(x.shape[:1], jnp.inf, x.dtype).at[step.only].set(some), *back(jnp.ones_like(some))
 
 
 def _evaluated(step: Step, x: Float[Array, "verts 3"]):
@@ -152,31 +160,87 @@ def _evaluated(step: Step, x: Float[Array, "verts 3"]):
     return value, gradient, contact
 
 
-def _factored(step: Step, x: Float[Array, "verts 3"], contact):
-    """A positive definite approximation of the energy's Hessian, factored."""
+def _blocks(step: Step, x: Float[Array, "verts 3"], contact):
+    """Blocks of a positive definite approximation of the energy's Hessian."""
     simulator, model = step.simulator, step.simulator.model
     diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, model.terms, contact)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
     mass = model.material.density * model.garment.mesh.vertex_area
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / step.frame.dt**2
-    diagonal = diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None]
-    return factorise(simulator.order, diagonal, off)
+    return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
+
+
+def _factored(step: Step, x: Float[Array, "verts 3"], contact):
+    return factorise(step.simulator.order, *_blocks(step, x, contact))
+
+
+def _descended(step: Step, x: Float[Array, "verts 3"], point, p: Float[Array, "verts 3"]):
+    """As far along p as the energy falls: the new positions, their `_evaluated`, and whether they moved."""
+    value, gradient, contact = point
+    slope = _dot(gradient, p)
+    noise = 4 * jnp.finfo(x.dtype).eps * jnp.abs(value)
+
+    def too_long(search):
+        t, (new, there, _) = search
+        lower = new <= value + 1e-4 * t * slope
+        # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
+        level = (jnp.abs(new - value) <= noise) & (_dot(there, p) <= 0) & (-t * slope <= noise)
+        return ~(lower | level) & (t > LEAST_STEP)
+
+    def at(t):
+        return t, _evaluated(step, x + t * p)
+
+    t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(jnp.min(_unhindered(contact, p))))
+    moved = t > LEAST_STEP
+    point = jax.tree.map(functools.partial(jnp.where, moved), new, point)
+    return jnp.where(moved, x + t * p, x), point, moved
+
+
+def _relaxed(step: Step, x: Float[Array, "verts 3"], point, left, tolerance):
+    """Positions after the patch of the greatest imbalance has found its own equilibrium, where that is most of what is left.
+
+    left: (verts,) squared imbalances over mass. Returns also how many steps the patch took.
+    """
+    patch = patch_around(left, step.simulator.model, step.simulator.couplings)
+    simulator = replace(step.simulator, model=patch.model, couplings=patch.couplings)
+    smooth = patch.model.terms.collision == "smooth"
+    local = replace(step, simulator=simulator, only=patch.verts if smooth else None)
+    moves = (patch.place < SIZE)[:, None]
+
+    def imbalance(point):
+        return jnp.where(moves[:, 0], _imbalance(step, point[1]), 0)
+
+    def unfinished(state):
+        _, point, count, moved = state
+        return moved & (count < LOCAL) & (jnp.sum(imbalance(point)) > 0.25 * tolerance)
+
+    def iterate(state):
+        x, point, count, _ = state
+        _, gradient, contact = point
+        p = -solve_dense(patch, *_blocks(local, x, contact), gradient)
+        return (*_descended(local, x, point, p)[:2], count + 1, jnp.asarray(True))
+
+    worth = patch.whole & (jnp.sum(jnp.where(moves[:, 0], left, 0)) > SHARE * jnp.sum(left))
+    state = (x, _evaluated(local, x), jnp.zeros((), jnp.int32), worth)
+    x, _, count, _ = lax.while_loop(unfinished, iterate, state)
+    return x, count
+
+
+def _imbalance(step: Step, gradient: Float[Array, "verts 3"]) -> Float[Array, "verts"]:
+    """Squared out-of-balance forces over mass; none where there is no mass."""
+    mass = step.simulator.model.material.density * step.simulator.model.garment.mesh.vertex_area
+    return jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / jnp.where(mass > 0, mass, 1), 0)
 
 
 def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
     """Positions that minimise the energy, found from `start`."""
     model = step.simulator.model
-    mass = model.material.density * model.garment.mesh.vertex_area
-    heavy = jnp.where(mass > 0, mass, 1)
+    mass = jnp.sum(model.material.density * model.garment.mesh.vertex_area)
     dtype = start.dtype
     tolerance = settings.tolerance
     if tolerance is None:
         tolerance = 0.1 if dtype == jnp.float32 else 0.001
     limit = jnp.where(step.moving > 0, settings.iterations, settings.first)
-
-    def residual(gradient):
-        square = jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / heavy, 0)
-        return jnp.sqrt(jnp.sum(square) / jnp.sum(mass)) / STANDARD_GRAVITY
 
     def unfinished(state):
         _, _, iteration, status, _ = state
@@ -184,34 +248,29 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
 
     def iterate(state):
         x, point, iteration, _, _ = state
-        value, gradient, contact = point
+        _, gradient, contact = point
         p = -solve(step.simulator.order, _factored(step, x, contact), gradient)
-        slope = _dot(gradient, p)
-        noise = 4 * jnp.finfo(dtype).eps * jnp.abs(value)
+        x, point, moved = _descended(step, x, point, p)
+        status, left = judged(point, ~moved, p)
+        if x.shape[0] > 4 * SIZE:
 
-        def too_long(search):
-            t, (new, there, _) = search
-            lower = new <= value + 1e-4 * t * slope
-            # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
-            level = (jnp.abs(new - value) <= noise) & (_dot(there, p) <= 0) & (-t * slope <= noise)
-            return ~(lower | level) & (t > LEAST_STEP)
+            def relax(x, point):
+                x, count = _relaxed(step, x, point, _imbalance(step, point[1]), mass * (tolerance * STANDARD_GRAVITY) ** 2)
+                point = lax.cond(count > 0, lambda: _evaluated(step, x), lambda: point)
+                return x, point, *judged(point, False, x)
 
-        def at(t):
-            return t, _evaluated(step, x + t * p)
-
-        t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(jnp.min(_unhindered(contact, p))))
-        moved = t > LEAST_STEP
-        x = jnp.where(moved, x + t * p, x)
-        point = jax.tree.map(functools.partial(jnp.where, moved), new, point)
-        return x, point, iteration + 1, *judged(point, ~moved, p)
+            x, point, status, left = lax.cond(status < 0, relax, lambda x, point: (x, point, status, left), x, point)
+        return x, point, iteration + 1, status, left
 
     def judged(point, stuck, p):
         value, gradient, _ = point
-        left = residual(gradient)
+        left = jnp.sqrt(jnp.sum(_imbalance(step, gradient)) / mass) / STANDARD_GRAVITY
         finite = jnp.isfinite(value) & jnp.isfinite(left) & jnp.all(jnp.isfinite(p))
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
+    if step.body is not None and model.terms.collision in ("plane", "smooth"):
+        step = replace(step, normals=vertex_normals(step.body, model.surface))
     point = _evaluated(step, start)
     state = (start, point, jnp.zeros((), jnp.int32), *judged(point, False, start))
     x, _, iterations, status, left = lax.while_loop(unfinished, iterate, state)

@@ -271,8 +271,12 @@ def plane_distance(
 
 
 def smooth_distance(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], normals: Float[Array, "body 3"], surface: Surface
-) -> Float[Array, "verts"]:
+    x: Float[Array, "verts 3"],
+    body: Float[Array, "body 3"],
+    normals: Float[Array, "body 3"],
+    surface: Surface,
+    only: Int[Array, "chosen"] | None = None,
+) -> Float[Array, "some"]:
     """Signed distance in m to a smooth surface through the body's vertices, negative inside.
 
         d = sum_i w_i n_i . (x - b_i) / sum_i w_i,   w_i = exp(-|x - b_i|^2 / h^2),   h the mean edge length of the body
@@ -281,7 +285,7 @@ def smooth_distance(
     that one jumps where the nearest vertex changes, so cloth that rests there has no equilibrium, while this has derivatives
     of every order. On a convex part it lies outside the vertices by about h^2/4 times the mean curvature. Only the vertices of
     the nearest groups are summed: of a garment near the body, what is left out changes 99 vertices of 100 by less than h/200
-    (`tests/test_collision.py`), and single ones by up to h/7 where a group of cloth is wide.
+    (`tests/test_collision.py`), and single ones by up to h/7 where a group of cloth is wide. With `only`, of these vertices.
 
     Source: Kolluri 2005 (implicit moving least squares).
     """
@@ -301,13 +305,14 @@ def smooth_distance(
         nearest = lax.stop_gradient(square.min(axis=1, keepdims=True))
         weight = jnp.exp((nearest - square) / width)
         columns = jnp.stack([jnp.ones_like(n[:, 0]), *n.T, jnp.sum(n * at, axis=1)], axis=1)
-        sums = product(
-            weight, jnp.where(first[chosen].reshape(-1, 1) == 1, columns, 0)
-        )  # a short block repeats its last vertex
+        once = first[chosen].reshape(-1, 1) == 1  # a short block repeats its last vertex
+        sums = product(weight, jnp.where(once, columns, 0))
         return (jnp.sum(sums[:, 1:4] * points, axis=1) - sums[:, 4]) / sums[:, 0]
 
-    distance = lax.map(group, (cloth, chosen), batch_size=16)
-    return distance.reshape(-1)[surface.cloth_place]
+    if only is not None:
+        cloth, chosen = x[only][:, None], chosen[surface.cloth_place[only] // surface.cloth_blocks.shape[1]]
+    distance = lax.map(group, (cloth, chosen), batch_size=16).reshape(-1)
+    return distance[surface.cloth_place] if only is None else distance
 
 
 def triangle_distance(
