@@ -91,7 +91,7 @@ def simulate(
     model = assembly.model
     records = [] if name is None else [load_motion(lone, name, assembly.body)]
     matrices = (track_of(model, *records) if records else assembly.track).matrices
-    settings = Settings(tolerance=spec.tolerance or None, iterations=spec.iterations)
+    settings = Settings(tolerance=spec.tolerance or None, iterations=spec.iterations, inertia=scene.physics.inertia)
     simulator = simulator_from(model)
     state = stepper(simulator, settings).init()
     frames = 1 + (len(matrices) - 1) // spec.substeps

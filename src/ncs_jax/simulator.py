@@ -26,7 +26,7 @@ from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.objective import Frame, distances, energies
-from ncs_jax.patch import SIZE, patch_around, solve_dense
+from ncs_jax.patch import SIZE, Patch, patch_around, solve_dense
 from ncs_jax.stiffness import Couplings, couplings_from, stiffness
 
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Simulation", "Simulator", "Solution", "simulate",
@@ -48,6 +48,7 @@ class Settings:
     tolerance: float | None = None
     iterations: int = 100
     first: int = 1000  # iterations of the first frame, which starts far from rest
+    inertia: bool = True  # False: every frame is the static state in its pose
 
 
 @jax.tree_util.register_dataclass
@@ -196,19 +197,24 @@ def _descended(step: Step, x: Float[Array, "verts 3"], point, p: Float[Array, "v
     return jnp.where(moved, x + t * p, x), point, moved
 
 
-def _relaxed(step: Step, x: Float[Array, "verts 3"], point, left, tolerance):
-    """Positions after the patch of the greatest imbalance has found its own equilibrium, where that is most of what is left.
+def _on_patch(step: Step, patch: Patch) -> Step:
+    """The same frame seen by a patch alone."""
+    simulator = replace(step.simulator, model=patch.model, couplings=patch.couplings)
+    return replace(step, simulator=simulator, only=patch.verts if patch.model.terms.collision == "smooth" else None)
 
-    left: (verts,) squared imbalances over mass. Returns also how many steps the patch took.
+
+def _relaxed(step: Step, x: Float[Array, "verts 3"], left: Float[Array, "verts"], tolerance):
+    """Positions after the patch of the greatest imbalance has found its own equilibrium, if it holds most of what is left.
+
+    left: squared imbalances over mass, of which the patch shall keep no more than a quarter of `tolerance`. Returns also how
+    many steps the patch took.
     """
     patch = patch_around(left, step.simulator.model, step.simulator.couplings)
-    simulator = replace(step.simulator, model=patch.model, couplings=patch.couplings)
-    smooth = patch.model.terms.collision == "smooth"
-    local = replace(step, simulator=simulator, only=patch.verts if smooth else None)
-    moves = (patch.place < SIZE)[:, None]
+    local = _on_patch(step, patch)
+    moves = patch.place < SIZE
 
     def imbalance(point):
-        return jnp.where(moves[:, 0], _imbalance(step, point[1]), 0)
+        return jnp.where(moves, _imbalance(step, point[1]), 0)
 
     def unfinished(state):
         _, point, count, moved = state
@@ -220,7 +226,7 @@ def _relaxed(step: Step, x: Float[Array, "verts 3"], point, left, tolerance):
         p = -solve_dense(patch, *_blocks(local, x, contact), gradient)
         return (*_descended(local, x, point, p)[:2], count + 1, jnp.asarray(True))
 
-    worth = patch.whole & (jnp.sum(jnp.where(moves[:, 0], left, 0)) > SHARE * jnp.sum(left))
+    worth = patch.whole & (jnp.sum(jnp.where(moves, left, 0)) > SHARE * jnp.sum(left))
     state = (x, _evaluated(local, x), jnp.zeros((), jnp.int32), worth)
     x, _, count, _ = lax.while_loop(unfinished, iterate, state)
     return x, count
@@ -255,7 +261,7 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
         if x.shape[0] > 4 * SIZE:
 
             def relax(x, point):
-                x, count = _relaxed(step, x, point, _imbalance(step, point[1]), mass * (tolerance * STANDARD_GRAVITY) ** 2)
+                x, count = _relaxed(step, x, _imbalance(step, point[1]), mass * (tolerance * STANDARD_GRAVITY) ** 2)
                 point = lax.cond(count > 0, lambda: _evaluated(step, x), lambda: point)
                 return x, point, *judged(point, False, x)
 
@@ -385,7 +391,7 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
     ) -> tuple[State, Float[Array, "verts 3"]]:
         blended = blend(matrices, model.blend)
         body = None if model.body is None or model.surface is None else pose_body(model, matrices)
-        moving = state.started & model.terms.inertia
+        moving = state.started & settings.inertia
         problem = Step(
             simulator, body, blended if model.terms.pinning else None, project(state.previous, state.before), force,
             moving.astype(dtype),

@@ -1,0 +1,95 @@
+"""A patch is the whole garment as far as its own vertices can tell."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.energies.collision import vertex_normals
+from ncs_jax.model import pose_body
+from ncs_jax.patch import SIZE, patch_around, solve_dense
+from ncs_jax.simulator import Step, _blocks, _evaluated, _imbalance, _on_patch, _relaxed, simulator_from
+
+from .scenes import grid
+from .test_simulator import written
+from .test_stiffness import dense
+from .verification.newton import QUICK
+
+evaluated = jax.jit(_evaluated, compiler_options=QUICK)
+relaxed = jax.jit(_relaxed, compiler_options=QUICK)
+
+
+@pytest.fixture(scope="module", params=["stvk", "mass_spring"])
+def problem(request, tmp_path_factory):
+    """A sheet of 625 vertices in the skin of a post, shaken in one corner, and the patch there."""
+    physics = {"membrane": {"model": request.param}, "collision": {"distance": "smooth"}}
+    assembly = written(tmp_path_factory.mktemp("patch"), *grid(25, 25, 0.012, (0, 0.4, 0.082)), **physics)
+    model = assembly.model
+    body = pose_body(model, assembly.track.matrices[0])
+    rest = model.garment.mesh.rest
+    noise = np.random.default_rng(5).normal(size=(60, 3)) * (np.arange(60) % 25 < 6)[:, None]
+    x = rest.at[:60].add(1e-3 * noise)
+    normals = vertex_normals(body, model.surface)
+    step = Step(simulator_from(model), body, None, rest, None, jnp.asarray(1.0), normals)
+    score = _imbalance(step, evaluated(step, x)[1] - evaluated(step, rest)[1])
+    patch = jax.jit(patch_around)(score, model, step.simulator.couplings)
+    assert patch.whole
+    return step, x, patch
+
+
+def test_it_lies_where_the_imbalance_is(problem):
+    _, _, patch = problem
+    verts = np.asarray(patch.verts)
+    assert len(np.unique(verts)) == SIZE
+    shaken = [v for v in range(60) if v % 25 < 6]
+    assert set(shaken) <= set(verts.tolist())
+    np.testing.assert_array_equal(np.asarray(patch.place)[verts], np.arange(SIZE))
+
+
+def test_forces_and_changes_of_energy_are_those_of_the_whole(problem, rng):
+    step, x, patch = problem
+    local = _on_patch(step, patch)
+    way = jnp.zeros_like(x).at[patch.verts].set(1e-3 * rng.normal(size=(SIZE, 3)))
+    here, there = evaluated(step, x), evaluated(step, x + way)
+    assert jnp.min(here[2][0]) < 0.003 < jnp.max(here[2][0])  # some of it is touched
+    mine = evaluated(local, x), evaluated(local, x + way)
+    np.testing.assert_allclose(mine[1][0] - mine[0][0], there[0] - here[0], rtol=1e-9)
+    for one, all_ in zip(mine, (here, there), strict=True):
+        size = float(jnp.abs(all_[1]).max())
+        np.testing.assert_allclose(one[1][patch.verts], all_[1][patch.verts], rtol=0, atol=1e-12 * size)
+
+
+def test_its_solve_is_that_of_the_dense_matrix(problem):
+    step, x, patch = problem
+    gradient = evaluated(step, x)[1]
+    blocks = partial(jax.jit(_blocks, compiler_options=QUICK), x=x)
+    local = _on_patch(step, patch)
+    found = jax.jit(solve_dense)(patch, *blocks(local, contact=evaluated(local, x)[2]), gradient)
+    whole = dense(step.simulator.couplings, *blocks(step, contact=evaluated(step, x)[2])).reshape(len(x), 3, len(x), 3)
+    v = np.asarray(patch.verts)
+    right = np.linalg.solve(whole[v][:, :, v].reshape(3 * SIZE, -1), np.asarray(gradient)[v].reshape(-1))
+    np.testing.assert_allclose(np.asarray(found)[v].reshape(-1), right, rtol=0, atol=1e-9 * np.abs(right).max())
+    held = np.setdiff1d(np.arange(len(x)), v)
+    assert not np.asarray(found)[held].any()
+
+
+def test_it_comes_to_rest_alone_and_the_energy_falls(problem):
+    step, x, _ = problem
+    rest = step.simulator.model.garment.mesh.rest
+    before = evaluated(step, x)
+    left = _imbalance(step, before[1]) - _imbalance(step, evaluated(step, rest)[1])
+    enough = 1e-3 * float(jnp.sum(left))
+    after, count = relaxed(step, x, left, enough)
+    moved = np.flatnonzero(np.any(np.asarray(after != x), axis=1))
+    assert count > 0 and 0 < len(moved) <= SIZE
+    found = evaluated(step, after)
+    assert found[0] < before[0]
+    imbalance = np.asarray(_imbalance(step, found[1]))
+    assert imbalance[moved].sum() <= 0.25 * enough
+    # what holds too little of the imbalance is left alone
+    same, count = relaxed(step, x, left + jnp.max(left), enough)
+    assert count == 0 and jnp.array_equal(same, x)
