@@ -225,7 +225,8 @@ def _relaxed(step: Step, x: Float[Array, "verts 3"], left: Float[Array, "verts"]
         x, point, count, _ = state
         _, gradient, contact = point
         p = -solve_dense(patch, *_blocks(local, x, contact), gradient)
-        return (*_descended(local, x, point, p)[:2], count + 1, jnp.asarray(True))
+        x, point, moved = _descended(local, x, point, p)
+        return x, point, count + 1, moved
 
     worth = patch.whole & (jnp.sum(jnp.where(moves, left, 0)) > SHARE * jnp.sum(left))
     state = (x, _evaluated(local, x), jnp.zeros((), jnp.int32), worth)
