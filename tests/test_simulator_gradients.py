@@ -87,7 +87,7 @@ def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, co
     gradient, solution = jax.jit(jax.grad(moved, has_aux=True))(here)
     assert np.all(np.asarray(solution.status) == CONVERGED)
     for k, name in enumerate(directions):
-        step = 1e-4
+        step = 1e-5
         ends = [moved(here.at[k].set(sign * step)) for sign in (1, -1)]
         assert all(np.all(np.asarray(s.status) == CONVERGED) for _, s in ends)
         difference = float(ends[0][0] - ends[1][0]) / (2 * step)

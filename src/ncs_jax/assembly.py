@@ -207,9 +207,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
     surface = body_points = body_blend = None
     if collides:
         faces, points = _submesh(body.faces, prepared.part, len(body.vertices)), body.vertices[prepared.part]
-        # what a smooth distance leaves out is a jump of the energy, and a simulation comes to rest at such a jump
-        looked_at = 24 if physics.collision.distance == "smooth" else 12
-        surface = surface_from(garment.vertices, points, faces, groups=looked_at)
+        surface = surface_from(garment.vertices, points, faces, smooth=physics.collision.distance == "smooth")
         body_blend, body_points = blend_from(body_weights[:, kept], dtype=dtype), jnp.asarray(points, dtype)
     membrane = None if physics.membrane.model == "none" else physics.membrane.model
     numbers = tuple(getattr(physics.membrane, n) for n in MEMBRANES[membrane][1]) if membrane else ()

@@ -17,11 +17,12 @@ from ncs_jax.energies.baraff_witkin import baraff_witkin
 from ncs_jax.energies.bending import bending
 from ncs_jax.energies.collision import (
     Surface,
+    blended,
     collision,
+    nearby_quadrics,
     nearest_triangle,
     nearest_vertex,
     plane_distance,
-    smooth_distance,
     triangle_distance,
     vertex_normals,
 )
@@ -103,17 +104,22 @@ def distances(
     body: Float[Array, "body 3"],
     surface: Surface,
     terms: Terms,
-    normals: Float[Array, "body 3"] | None = None,
 ) -> Float[Array, "verts"]:
-    """Signed distance to the posed body in m by the scene's query; `normals`: of the body's vertices, where known."""
+    """Signed distance to the posed body in m by the scene's query."""
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
         return triangle_distance(x, body, surface, index)
-    normals = vertex_normals(body, surface) if normals is None else normals
     if terms.collision == "smooth":
-        return smooth_distance(x, body, normals, surface)
+        return blended(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
     index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
-    return plane_distance(x, body, normals, index)
+    return plane_distance(x, body, vertex_normals(body, surface), index)
+
+
+def _collision(x, body, surface, terms, material):
+    if terms.collision == "smooth":
+        near = nearby_quadrics(x, body, surface)
+        return material.collision * jnp.sum(blended(x, near, surface, material.thickness).shortfall)
+    return collision(distances(x, body, surface, terms), material.thickness, material.collision)
 
 
 def energies(
@@ -143,7 +149,7 @@ def energies(
             parts["bending"] = bending(x, mesh, material.bending)
     if terms.collision is not None:
         with jax.named_scope("collision"):
-            parts["collision"] = collision(distances(x, frame.body, surface, terms), material.thickness, material.collision)
+            parts["collision"] = _collision(x, frame.body, surface, terms, material)
     if terms.gravity:
         with jax.named_scope("gravity"):
             parts["gravity"] = gravity(x, mass, material.gravity)

@@ -21,12 +21,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.cholesky import Elimination, elimination, factorise, solve
-from ncs_jax.energies.collision import collision, smooth_distance, vertex_normals
+from ncs_jax.contact import Contact, touching
+from ncs_jax.energies.collision import Quadrics, nearby_quadrics
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
-from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.objective import Frame, energies
 from ncs_jax.patch import SIZE, Patch, patch_around, solve_dense
 from ncs_jax.stiffness import Couplings, couplings_from, stiffness
 
@@ -118,7 +119,7 @@ class Step:
     target: Float[Array, "verts 3"]  # where the vertices go without forces
     force: Float[Array, "verts 3"] | None  # external, N
     moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
-    normals: Float[Array, "body 3"] | None = None  # of the body, where they are found once a frame
+    near: Quadrics | None = None  # the body near the garment, where contact is smooth
     only: Int[Array, "some"] | None = None  # the vertices whose contact changes, if not all
 
     @property
@@ -138,34 +139,25 @@ def _energy(step: Step, x: Float[Array, "verts 3"], **without) -> Float[Array, "
     return value + step.moving * inertia(x, step.target, mass, step.frame.dt)
 
 
-def _touching(step: Step, x: Float[Array, "verts 3"]):
-    """Distances (verts,) to the body and their derivatives (verts, 3): a vertex's distance depends on it alone."""
+def _touching(step: Step, x: Float[Array, "verts 3"]) -> Contact | None:
     model = step.simulator.model
     if model.terms.collision is None:
         return None
-    if step.only is None:
-        depth, back = jax.vjp(lambda x: distances(x, step.body, model.surface, model.terms, step.normals), x)
-        return depth, *back(jnp.ones_like(depth))
-    some, back = jax.vjp(lambda x: smooth_distance(x, step.body, step.normals, model.surface, step.only), x)
-    return jnp.full(x.shape[:1], jnp.inf, x.dtype).at[step.only].set(some), *back(jnp.ones_like(some))
+    return touching(x, step.body, model.surface, model.material, model.terms, step.near, step.only)
 
 
 def _evaluated(step: Step, x: Float[Array, "verts 3"]):
-    """Energy, gradient and what is touched; the body is looked at once for all three."""
-    model = step.simulator.model
+    """Energy, gradient and contact."""
     value, gradient = jax.value_and_grad(lambda x: _energy(step, x, collision=None))(x)
     contact = _touching(step, x)
-    if contact is not None:
-        depth, normal = contact
-        push, slope = jax.value_and_grad(collision)(depth, model.material.thickness, model.material.collision)
-        value, gradient = value + push, gradient + slope[:, None] * normal
-    return value, gradient, contact
+    return (value, gradient, None) if contact is None else (value + contact.energy, gradient + contact.gradient, contact)
 
 
-def _blocks(step: Step, x: Float[Array, "verts 3"], contact):
+def _blocks(step: Step, x: Float[Array, "verts 3"], contact: Contact | None):
     """Blocks of a positive definite approximation of the energy's Hessian."""
     simulator, model = step.simulator, step.simulator.model
-    diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, model.terms, contact)
+    touching = None if contact is None else contact.blocks
+    diagonal, off = stiffness(x, simulator.couplings, model.garment, model.material, step.frame, model.terms, touching)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
     mass = model.material.density * model.garment.mesh.vertex_area
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / step.frame.dt**2
@@ -201,7 +193,7 @@ def _descended(step: Step, x: Float[Array, "verts 3"], point, p: Float[Array, "v
 def _on_patch(step: Step, patch: Patch) -> Step:
     """The same frame seen by a patch alone."""
     simulator = replace(step.simulator, model=patch.model, couplings=patch.couplings)
-    return replace(step, simulator=simulator, only=patch.verts if patch.model.terms.collision == "smooth" else None)
+    return replace(step, simulator=simulator, only=None if step.near is None else patch.verts)
 
 
 def _relaxed(step: Step, x: Float[Array, "verts 3"], left: Float[Array, "verts"], tolerance):
@@ -251,11 +243,13 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
     limit = jnp.where(step.moving > 0, settings.iterations, settings.first)
 
     def unfinished(state):
-        _, _, iteration, status, _ = state
+        *_, iteration, status, _ = state
         return (status < 0) & (iteration < limit)
 
     def iterate(state):
-        x, point, iteration, _, _ = state
+        x, point, seen, iteration, _, _ = state
+        seen, point = seen_again(seen, x, point)
+        step = at(seen)
         _, gradient, contact = point
         p = -solve(step.simulator.order, _factored(step, x, contact), gradient)
         x, point, moved = _descended(step, x, point, p)
@@ -268,7 +262,25 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
                 return x, point, *judged(point, False, x)
 
             x, point, status, left = lax.cond(status < 0, relax, lambda x, point: (x, point, status, left), x, point)
-        return x, point, iteration + 1, status, left
+        return x, point, seen, iteration + 1, status, left
+
+    def at(seen):
+        return step if seen is None else replace(step, near=seen[0])
+
+    def look(x):
+        return nearby_quadrics(x, step.body, model.surface), x
+
+    def seen_again(seen, x, point):
+        """The body near the garment: what was found last, unless a vertex has come far since."""
+        if seen is None:
+            return seen, point
+
+        def again():
+            seen = look(x)
+            return seen, _evaluated(at(seen), x)
+
+        come = jnp.max(jnp.sum((x - seen[1]) ** 2, axis=-1))
+        return lax.cond(come > model.surface.spacing.astype(dtype) ** 2, again, lambda: (seen, point))
 
     def judged(point, stuck, p):
         value, gradient, _ = point
@@ -277,11 +289,10 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    if step.body is not None and model.terms.collision in ("plane", "smooth"):
-        step = replace(step, normals=vertex_normals(step.body, model.surface))
-    point = _evaluated(step, start)
-    state = (start, point, jnp.zeros((), jnp.int32), *judged(point, False, start))
-    x, _, iterations, status, left = lax.while_loop(unfinished, iterate, state)
+    seen = look(start) if model.terms.collision == "smooth" else None
+    point = _evaluated(at(seen), start)
+    state = (start, point, seen, jnp.zeros((), jnp.int32), *judged(point, False, start))
+    x, *_, iterations, status, left = lax.while_loop(unfinished, iterate, state)
     return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))
 
 
@@ -289,7 +300,7 @@ def _unhindered(contact, p: Float[Array, "verts 3"]):
     """The share of a vertex's way p that does not carry it through the body: to the surface, and a little into it."""
     if contact is None:
         return jnp.ones((), p.dtype)
-    reach = jnp.maximum(contact[0], 0) * 0.9 + CLEARANCE
+    reach = jnp.maximum(contact.distance, 0) * 0.9 + CLEARANCE
     length = jnp.sqrt(jnp.sum(p * p, axis=-1))
     return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
 

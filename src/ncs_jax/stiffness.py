@@ -134,14 +134,14 @@ def stiffness(
     material: Material,
     frame: Frame,
     terms: Terms,
-    contact: tuple[Float[Array, "verts"], Float[Array, "verts 3"]] | None = None,
+    contact: Float[Array, "verts 3 3"] | None = None,
 ) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
     """Blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
 
-    contact: distances (verts,) to the body and their derivatives (verts, 3), where there is collision.
+    contact: the blocks of collision, where there is any, from `contact.touching`.
 
-    The membrane's element Hessians are projected; springs lose their negative part in closed form; bending and collision
-    enter by the squares of their first derivatives (Gauss-Newton), exact where the angle or distance is at its rest value.
+    The membrane's element Hessians are projected; springs lose their negative part in closed form; bending
+    enters by the squares of its first derivatives (Gauss-Newton), exact where the angle is at its rest value.
     """
     mesh = garment.mesh
     diagonal = jnp.zeros((*x.shape, 3), x.dtype)
@@ -170,10 +170,8 @@ def stiffness(
         diagonal = diagonal.at[mesh.hinges].add(scaled[..., :, None] * gradient[..., None, :])
         sides = [scaled[:, k, :, None] * gradient[:, other, None, :] for k, other in HINGE]
         off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
-    if terms.collision is not None:
-        depth, normal = contact
-        active = jnp.where(depth < material.thickness, 2 * material.collision, 0)
-        diagonal = diagonal + active[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    if contact is not None:
+        diagonal = diagonal + contact
     if terms.pinning:
         pins = garment.pins
         linear = frame.blended[pins][..., :3]
