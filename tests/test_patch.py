@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.collision import nearby_quadrics
+from ncs_jax.energies.smooth_contact import nearby_quadrics
 from ncs_jax.model import pose_body
 from ncs_jax.patch import SIZE, patch_around, solve_dense
 from ncs_jax.simulator import Step, _blocks, _evaluated, _imbalance, _on_patch, _relaxed, simulator_from

@@ -17,9 +17,7 @@ from ncs_jax.energies.baraff_witkin import baraff_witkin
 from ncs_jax.energies.bending import bending
 from ncs_jax.energies.collision import (
     Surface,
-    blended,
     collision,
-    nearby_quadrics,
     nearest_triangle,
     nearest_vertex,
     plane_distance,
@@ -31,6 +29,7 @@ from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.mass_spring import mass_spring
 from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.pinning import pinning
+from ncs_jax.energies.smooth_contact import blended, nearby_quadrics
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import Mesh

@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.cholesky import Elimination, elimination, factorise, solve
 from ncs_jax.contact import Contact, touching
-from ncs_jax.energies.collision import Quadrics, nearby_quadrics
 from ncs_jax.energies.inertia import inertia, project
+from ncs_jax.energies.smooth_contact import Quadrics, nearby_quadrics
 from ncs_jax.kinematics import blend, forward, skin, transforms, unpose
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track

@@ -6,9 +6,7 @@ integers and carries no derivative. The *distance* is then a smooth function of 
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +15,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.mesh import topology, vertex_rings
-from ncs_jax.numerics import angle_between, norm, normalize
+from ncs_jax.numerics import angle_between, normalize
 
 __all__ = [
-    "Blended",
-    "Quadrics",
     "Surface",
-    "blended",
     "closest_weights",
     "collision",
     "face_normals",
-    "nearby_quadrics",
+    "nearest_groups",
     "nearest_triangle",
     "nearest_vertex",
     "plane_distance",
@@ -200,7 +195,7 @@ def _smallest(values, count):
     return chosen, left.min(axis=0)
 
 
-def _nearest_groups(cloth, grouped, count):
+def nearest_groups(cloth, grouped, count):
     """Of every cloth group, the squared gap of bounding boxes to the first group left out, and the `count` nearest groups."""
     corners = grouped.reshape(len(grouped), -1, 3)
     low, high = corners.min(axis=1), corners.max(axis=1)
@@ -217,7 +212,7 @@ def _candidates(x, features, blocks, surface, squared):
     """
     grouped = features[blocks]  # (clusters, size, [3 corners,] 3)
     cloth = x[surface.cloth_blocks]
-    bound, chosen = _nearest_groups(cloth, grouped, surface.groups)
+    bound, chosen = nearest_groups(cloth, grouped, surface.groups)
     listed = grouped[chosen].reshape(len(cloth), -1, *features.shape[1:])
     names = blocks[chosen].reshape(len(cloth), -1)
     # (list, [3 corners,] 3, cloth groups, 1) against x (3, cloth groups, lanes)
@@ -276,125 +271,6 @@ def plane_distance(
 ) -> Float[Array, "verts"]:
     """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
     return jnp.sum(normals[index] * (x - body[index]), axis=-1)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Quadrics:
-    """The body near every group of cloth, as `blended` takes it: one quadric a body vertex, seen from the group's centre, m."""
-
-    centres: Float[Array, "blocks 1 3"]
-    points: Float[Array, "blocks near 3"]  # the body's vertices
-    squares: Float[Array, "blocks 1 near"]  # of their distances from the centre; infinite for one that is repeated
-    normals: Float[Array, "blocks near 3"]
-    coefficients: Float[Array, "blocks near 10"]  # of the distances, as polynomials
-
-
-class Blended(NamedTuple):
-    """What the quadrics near a vertex say together."""
-
-    shortfall: Float[Array, "some"]  # m^2: square of what is missing of the distance to keep
-    directions: Float[Array, "some 3 3"]  # about half of its second derivative
-    distance: Float[Array, "some"]  # m, negative inside
-
-
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
-ELSEWHERE = 0.1  # what a quadric that faces another way counts where the own sheet of the body is looked at
-SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
-
-
-def _products(v):
-    return jnp.stack([v[..., i] * v[..., j] for i, j in PAIRS], axis=-1)
-
-
-def curvatures(body: Float[Array, "body 3"], normals: Float[Array, "body 3"], surface: Surface) -> Float[Array, "body 3 3"]:
-    """Shape operators of the body's vertices in 1/m: how the normal turns along the surface, dn = S dx.
-
-    The mean over the faces around, weighted by area, of the normals' gradient, symmetric and within the tangent plane; no
-    greater than the mesh can show. Source: Rusinkiewicz 2004, by linear elements.
-    """
-    p, n = body[surface.faces], normals[surface.faces]
-    face = jnp.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    # 2 area x the gradients of the barycentric coordinates
-    slopes = jnp.cross(normalize(face)[:, None], jnp.roll(p, 1, axis=1) - jnp.roll(p, -1, axis=1))
-    turn = jnp.sum(n[..., :, None] * slopes[..., None, :], axis=1)
-    table = jnp.concatenate([turn.reshape(-1, 9), norm(face)[:, None]], axis=1)
-    sums = jnp.sum(jnp.concatenate([table, jnp.zeros_like(table[:1])])[surface.rings], axis=1)
-    area = sums[:, 9:, None]
-    mean = sums[:, :9].reshape(-1, 3, 3) / jnp.where(area > 0, area, 1)
-    across = jnp.eye(3, dtype=body.dtype)[None] - normals[:, :, None] * normals[:, None, :]
-    flat = jnp.einsum("bij,bjk,bkl->bil", across, (mean + jnp.swapaxes(mean, 1, 2)) / 2, across, precision="highest")
-    most = SHARPEST / surface.spacing.astype(body.dtype)
-    size = norm(flat.reshape(-1, 9))[:, None, None]
-    return flat * jnp.where(size > most, most / jnp.where(size > most, size, 1), 1)
-
-
-def nearby_quadrics(x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface) -> Quadrics:
-    """The quadrics of the groups of body vertices that lie nearest to every group of cloth vertices."""
-    blocks = surface.vertex_blocks
-    cloth = lax.stop_gradient(x)[surface.cloth_blocks]
-    _, chosen = _nearest_groups(cloth, lax.stop_gradient(body)[blocks], surface.groups)
-    names = blocks[chosen].reshape(len(cloth), -1)
-    first = jnp.concatenate([jnp.ones_like(blocks[:, :1], bool), blocks[:, 1:] != blocks[:, :-1]], axis=1)
-    once = first[chosen].reshape(names.shape)
-    normals = vertex_normals(body, surface)
-    table = jnp.concatenate([body, normals, curvatures(body, normals, surface).reshape(-1, 9)], axis=1)[names]
-    centres = jnp.mean(cloth, axis=1, keepdims=True)  # near it no product of `blended` cancels
-    points, n, bend = table[..., :3] - centres, table[..., 3:6], table[..., 6:].reshape(*names.shape, 3, 3)
-    turn = jnp.sum(bend * points[..., None, :], axis=-1)
-    second = jnp.stack([bend[..., i, j] * (0.5 if i == j else 1) for i, j in PAIRS], axis=-1)
-    constant = jnp.sum((turn / 2 - n) * points, axis=-1, keepdims=True)
-    squares = jnp.where(once, jnp.sum(points * points, axis=-1), jnp.inf)
-    return Quadrics(centres, points, squares[:, None], n, jnp.concatenate([second, n - turn, constant], axis=-1))
-
-
-def blended(
-    x: Float[Array, "verts 3"],
-    quadrics: Quadrics,
-    surface: Surface,
-    thickness: Float[Array, ""] | float,
-    only: Int[Array, "some"] | None = None,
-) -> Blended:
-    """Contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
-
-        shortfall = sum_i v_i min(d_i - thickness, 0)^2
-        d_i = n_i . (x - b_i) + (x - b_i) . S_i (x - b_i) / 2,   S_i the shape operator at b_i
-        v_i = (1 + c) w_i / sum_j w_j (f_ij + c),   w_i = exp(-4 |x - b_i|^2 / h^2),   f_ij = (1 + n_i . n_j)^2 / 4
-
-    with c = 0.1 and h the mean edge length of the resting body. On one sheet of the body v is a mean. Two sheets that face each
-    other, as an arm and the torso, push each by itself: one mean of both would let what the one has to spare make good what
-    the other misses. To the plane of the nearest vertex this is what a smooth hill is to a stair: that one jumps where the
-    nearest vertex changes, so cloth that rests there has no equilibrium. `only`: of these vertices; otherwise of all.
-
-    The distance is the mean of d_i by w_i. Source: Kolluri 2005 (implicit moving least squares), there for planes and one mean.
-    """
-    near, cloth = quadrics, x[surface.cloth_blocks]
-    if only is not None:
-        near = jax.tree.map(lambda table: table[surface.cloth_place[only] // surface.cloth_blocks.shape[1]], quadrics)
-        cloth = x[only][:, None]
-    product = functools.partial(jnp.matmul, precision="highest")
-    cloth = cloth - near.centres
-    square = near.squares - 2 * product(cloth, jnp.swapaxes(near.points, 1, 2))  # less |x|^2, which no weight depends on
-    nearest = lax.stop_gradient(jnp.min(square, axis=-1, keepdims=True))
-    weight = jnp.exp((nearest - square) * (4 / surface.spacing.astype(x.dtype) ** 2))
-    powers = jnp.concatenate([_products(cloth), cloth, jnp.ones_like(cloth[..., :1])], axis=-1)
-    distance = product(powers, jnp.swapaxes(near.coefficients, 1, 2))
-    squares = _products(near.normals)
-    one = jnp.ones_like(squares[..., :1])
-    twice = jnp.stack([squares[..., k] * (1 if i == j else 2) for k, (i, j) in enumerate(PAIRS)], axis=-1)
-    facing = jnp.concatenate([(0.25 + ELSEWHERE) * one, 0.5 * near.normals, 0.25 * twice], axis=-1)
-    sums = product(weight, jnp.concatenate([one, near.normals, squares], axis=-1))
-    share = (1 + ELSEWHERE) * weight / product(sums, jnp.swapaxes(facing, 1, 2))
-    short = jnp.minimum(distance - thickness, 0)
-    directions = product(jnp.where(short < 0, share, 0), squares)
-    full = jnp.stack([directions[..., PAIRS.index((min(i, j), max(i, j)))] for i in range(3) for j in range(3)], axis=-1)
-    result = Blended(
-        jnp.sum(share * short * short, axis=-1),
-        full.reshape(*full.shape[:-1], 3, 3),
-        jnp.sum(weight * distance, axis=-1) / sums[..., 0],
-    )
-    flat = jax.tree.map(lambda table: table.reshape(-1, *table.shape[2:]), result)
-    return flat if only is not None else jax.tree.map(lambda table: table[surface.cloth_place], flat)
 
 
 def triangle_distance(
