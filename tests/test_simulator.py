@@ -27,7 +27,7 @@ from .shapes import tube
 pytestmark = pytest.mark.slow
 
 TOLERANCE = 1e-6
-SETTINGS = Settings(tolerance=TOLERANCE, iterations=1000)
+SETTINGS = Settings(tolerance=TOLERANCE, iterations=300)
 run = jax.jit(simulate, static_argnums=2)
 
 
@@ -94,7 +94,7 @@ def test_every_frame_is_solved_and_says_how_well(scene, moved):
     assert np.all(np.asarray(solution.iterations) >= 1)
     # by the judge of networks, who knows nothing of the solver
     rows = measure(model, x, track)
-    np.testing.assert_allclose(rows["out_of_balance"], residual, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(rows["out_of_balance"], residual, rtol=0, atol=1e-9)
     speed = np.abs(np.diff(x, axis=0)).max() * model.fps
     assert speed > 0.3  # something was going on
 
@@ -180,8 +180,7 @@ def test_single_precision(tmp_path, moved, plain_jax):
     x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(0.01))
     assert x.dtype == jnp.float32 and solution.residual.dtype == jnp.float32
     assert np.all(np.asarray(solution.status) == CONVERGED)
-    # a vertex may buckle to the other side
-    assert np.quantile(np.abs(np.asarray(x) - moved[0]), 0.99) < 1e-3
+    np.testing.assert_allclose(np.asarray(x), moved[0], rtol=0, atol=1e-3)
 
 
 def test_motions_in_a_batch_equal_the_loop(scene, moved):
