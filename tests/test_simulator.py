@@ -27,7 +27,7 @@ from .shapes import tube
 pytestmark = pytest.mark.slow
 
 TOLERANCE = 1e-6
-SETTINGS = Settings(tolerance=TOLERANCE, iterations=300)
+SETTINGS = Settings(tolerance=TOLERANCE, iterations=400)  # one frame leaves a state that is all but unstable, in 310
 run = jax.jit(simulate, static_argnums=2)
 
 
@@ -174,10 +174,10 @@ def test_the_order_of_the_vertices_does_not_matter(tmp_path, moved):
 
 
 def test_single_precision(tmp_path, moved, plain_jax):
-    """As a user has it, with its own tolerance: near the exact motion, and said to be solved."""
+    """Near the exact motion, and said to be solved; at 0.003 g, for what is left over 10 frames grows with the tolerance."""
     assembly = sleeve(tmp_path, jnp.float32)
     motion = next(iter(assembly.motions.values()))
-    x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(0.01))
+    x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(0.003))
     assert x.dtype == jnp.float32 and solution.residual.dtype == jnp.float32
     assert np.all(np.asarray(solution.status) == CONVERGED)
     np.testing.assert_allclose(np.asarray(x), moved[0], rtol=0, atol=1e-3)

@@ -119,7 +119,8 @@ class Step:
     target: Float[Array, "verts 3"]  # where the vertices go without forces
     force: Float[Array, "verts 3"] | None  # external, N
     moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
-    near: Quadrics | None = None  # the body near the garment, where contact is smooth
+    near: Quadrics | None = None  # the body near the garment, where contact is smooth,
+    seen: Float[Array, "verts 3"] | None = None  # as it was found from here
     only: Int[Array, "some"] | None = None  # the vertices whose contact changes, if not all
 
     @property
@@ -144,6 +145,19 @@ def _touching(step: Step, x: Float[Array, "verts 3"]) -> Contact | None:
     if model.terms.collision is None:
         return None
     return touching(x, step.body, model.surface, model.material, model.terms, step.near, step.only)
+
+
+def _look(step: Step, x: Float[Array, "verts 3"]):
+    """The body near the garment, if its contact is smooth, and from where it was seen."""
+    model = step.simulator.model
+    if model.terms.collision != "smooth":
+        return None
+    x, body = lax.stop_gradient(x), lax.stop_gradient(step.body)
+    return nearby_quadrics(x, body, model.surface), x
+
+
+def _with(step: Step, seen) -> Step:
+    return step if seen is None else replace(step, near=seen[0], seen=seen[1])
 
 
 def _evaluated(step: Step, x: Float[Array, "verts 3"]):
@@ -232,24 +246,22 @@ def _imbalance(step: Step, gradient: Float[Array, "verts 3"]) -> Float[Array, "v
     return jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / jnp.where(mass > 0, mass, 1), 0)
 
 
-def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
+def _minimise(settings: Settings, problem: Step, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
     """Positions that minimise the energy, found from `start`."""
-    model = step.simulator.model
+    model = problem.simulator.model
     mass = jnp.sum(model.material.density * model.garment.mesh.vertex_area)
-    dtype = start.dtype
     tolerance = settings.tolerance
     if tolerance is None:
-        tolerance = 0.1 if dtype == jnp.float32 else 0.001
-    limit = jnp.where(step.moving > 0, settings.iterations, settings.first)
+        tolerance = 0.1 if start.dtype == jnp.float32 else 0.001
+    limit = jnp.where(problem.moving > 0, settings.iterations, settings.first)
 
     def unfinished(state):
-        *_, iteration, status, _ = state
+        *_, status, _, iteration = state
         return (status < 0) & (iteration < limit)
 
     def iterate(state):
-        x, point, seen, iteration, _, _ = state
-        seen, point = seen_again(seen, x, point)
-        step = at(seen)
+        x, point, seen, _, _, iteration = state
+        step = _with(problem, seen)
         _, gradient, contact = point
         p = -solve(step.simulator.order, _factored(step, x, contact), gradient)
         x, point, moved = _descended(step, x, point, p)
@@ -262,37 +274,33 @@ def _minimise(settings: Settings, step: Step, start: Float[Array, "verts 3"]) ->
                 return x, point, *judged(point, False, x)
 
             x, point, status, left = lax.cond(status < 0, relax, lambda x, point: (x, point, status, left), x, point)
-        return x, point, seen, iteration + 1, status, left
+        return x, *looked_again(x, point, seen, status, left), iteration + 1
 
-    def at(seen):
-        return step if seen is None else replace(step, near=seen[0])
-
-    def look(x):
-        return nearby_quadrics(x, step.body, model.surface), x
-
-    def seen_again(seen, x, point):
-        """The body near the garment: what was found last, unless a vertex has come far since."""
+    def looked_again(x, point, seen, status, left):
+        """With the body found anew where a vertex has come far since it was, and before the frame is done in any case."""
         if seen is None:
-            return seen, point
+            return point, seen, status, left
 
         def again():
-            seen = look(x)
-            return seen, _evaluated(at(seen), x)
+            seen = _look(problem, x)
+            point = _evaluated(_with(problem, seen), x)
+            return point, seen, *judged(point, status == STALLED, x)
 
         come = jnp.max(jnp.sum((x - seen[1]) ** 2, axis=-1))
-        return lax.cond(come > model.surface.spacing.astype(dtype) ** 2, again, lambda: (seen, point))
+        far = jnp.where(status == CONVERGED, 0, model.surface.spacing.astype(x.dtype) ** 2)
+        return lax.cond(come > far, again, lambda: (point, seen, status, left))
 
     def judged(point, stuck, p):
         value, gradient, _ = point
-        left = jnp.sqrt(jnp.sum(_imbalance(step, gradient)) / mass) / STANDARD_GRAVITY
+        left = jnp.sqrt(jnp.sum(_imbalance(problem, gradient)) / mass) / STANDARD_GRAVITY
         finite = jnp.isfinite(value) & jnp.isfinite(left) & jnp.all(jnp.isfinite(p))
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    seen = look(start) if model.terms.collision == "smooth" else None
-    point = _evaluated(at(seen), start)
-    state = (start, point, seen, jnp.zeros((), jnp.int32), *judged(point, False, start))
-    x, *_, iterations, status, left = lax.while_loop(unfinished, iterate, state)
+    seen = None if problem.near is None else (problem.near, problem.seen)
+    point = _evaluated(problem, start)
+    state = (start, *looked_again(start, point, seen, *judged(point, False, start)), jnp.zeros((), jnp.int32))
+    x, _, _, status, left, iterations = lax.while_loop(unfinished, iterate, state)
     return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))
 
 
@@ -375,11 +383,12 @@ def _conjugate_gradients(matrix: Callable, preconditioner: Callable, right: Floa
     return lax.while_loop(unfinished, iterate, state)[0]
 
 
-def _expected(step: Step, state: State, blended: Float[Array, "verts 3 4"]) -> Float[Array, "verts 3"]:
+def _expected(step: Step, state: State, blended: Float[Array, "verts 3 4"]) -> tuple[Step, Float[Array, "verts 3"]]:
     """Where a frame's search starts: the last frame goes on as it moves in unposed space, but through no limb, however fast."""
     carried = skin(blended, state.unposed)
+    step = _with(step, _look(step, carried))
     onward = skin(blended, 2 * state.unposed - state.unposed_before) - carried
-    return carried + jnp.atleast_1d(_unhindered(_touching(step, carried), onward))[:, None] * onward
+    return step, carried + jnp.atleast_1d(_unhindered(_touching(step, carried), onward))[:, None] * onward
 
 
 def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
@@ -409,7 +418,8 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
             simulator, body, blended if model.terms.pinning else None, project(state.previous, state.before), force,
             moving.astype(dtype),
         )  # fmt: skip
-        x, solution = _equilibrium(settings, problem, lax.stop_gradient(_expected(problem, state, blended)))
+        problem, start = _expected(problem, state, blended)
+        x, solution = _equilibrium(settings, problem, lax.stop_gradient(start))
         unposed = unpose(blended, x)
         first = ~state.started
         before = (jnp.where(first, x, state.previous), jnp.where(first, unposed, state.unposed))
