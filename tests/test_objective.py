@@ -33,6 +33,7 @@ def material(model="stvk", gravity=DOWN):
         bending=array(1e-5),
         collision=array(10.0),
         thickness=array(0.004),
+        friction=array(0.0),
         pinning=array(1000.0),
         gravity=array(gravity),
     )

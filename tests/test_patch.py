@@ -11,16 +11,18 @@ import pytest
 
 from ncs_jax.energies.smooth_contact import nearby_quadrics
 from ncs_jax.model import pose_body
-from ncs_jax.patch import SIZE, patch_around, solve_dense
-from ncs_jax.simulator import Step, _blocks, _evaluated, _imbalance, _on_patch, _relaxed, simulator_from
+from ncs_jax.simulator import simulator_from
+from ncs_jax.solver import minimise
+from ncs_jax.solver import problem as frame
+from ncs_jax.solver.patch import SIZE, patch_around, solve_dense
 
 from .scenes import grid
 from .test_simulator import written
 from .test_stiffness import dense
 from .verification.newton import QUICK
 
-evaluated = jax.jit(_evaluated, compiler_options=QUICK)
-relaxed = jax.jit(_relaxed, compiler_options=QUICK)
+evaluated = jax.jit(frame.evaluated, compiler_options=QUICK)
+relaxed = jax.jit(minimise.relaxed, compiler_options=QUICK)
 
 
 @pytest.fixture(scope="module", params=["stvk", "mass_spring"])
@@ -34,9 +36,10 @@ def problem(request, tmp_path_factory):
     noise = np.random.default_rng(5).normal(size=(60, 3)) * (np.arange(60) % 25 < 6)[:, None]
     x = rest.at[:60].add(1e-3 * noise)
     near = jax.jit(nearby_quadrics)(x, body, model.surface)
-    step = Step(simulator_from(model), body, None, rest, None, jnp.asarray(1.0), near)
-    score = _imbalance(step, evaluated(step, x)[1] - evaluated(step, rest)[1])
-    patch = jax.jit(patch_around)(score, model, step.simulator.couplings)
+    simulator = simulator_from(model)
+    step = frame.Problem(model, simulator.couplings, simulator.order, body, None, rest, None, jnp.asarray(1.0), near=near)
+    score = frame.imbalance(step, evaluated(step, x)[1] - evaluated(step, rest)[1])
+    patch = jax.jit(patch_around)(score, model, step.couplings)
     assert patch.whole
     return step, x, patch
 
@@ -52,7 +55,7 @@ def test_it_lies_where_the_imbalance_is(problem):
 
 def test_forces_and_changes_of_energy_are_those_of_the_whole(problem, rng):
     step, x, patch = problem
-    local = _on_patch(step, patch)
+    local = minimise._on_patch(step, patch)
     way = jnp.zeros_like(x).at[patch.verts].set(1e-3 * rng.normal(size=(SIZE, 3)))
     here, there = evaluated(step, x), evaluated(step, x + way)
     assert jnp.min(here[2].distance) < 0.003 < jnp.max(here[2].distance)  # some of it is touched
@@ -66,10 +69,10 @@ def test_forces_and_changes_of_energy_are_those_of_the_whole(problem, rng):
 def test_its_solve_is_that_of_the_dense_matrix(problem):
     step, x, patch = problem
     gradient = evaluated(step, x)[1]
-    blocks = partial(jax.jit(_blocks, compiler_options=QUICK), x=x)
-    local = _on_patch(step, patch)
+    blocks = partial(jax.jit(frame.blocks, compiler_options=QUICK), x=x)
+    local = minimise._on_patch(step, patch)
     found = jax.jit(solve_dense)(patch, *blocks(local, contact=evaluated(local, x)[2]), gradient)
-    whole = dense(step.simulator.couplings, *blocks(step, contact=evaluated(step, x)[2])).reshape(len(x), 3, len(x), 3)
+    whole = dense(step.couplings, *blocks(step, contact=evaluated(step, x)[2])).reshape(len(x), 3, len(x), 3)
     v = np.asarray(patch.verts)
     right = np.linalg.solve(whole[v][:, :, v].reshape(3 * SIZE, -1), np.asarray(gradient)[v].reshape(-1))
     np.testing.assert_allclose(np.asarray(found)[v].reshape(-1), right, rtol=0, atol=1e-9 * np.abs(right).max())
@@ -79,16 +82,16 @@ def test_its_solve_is_that_of_the_dense_matrix(problem):
 
 def test_it_comes_to_rest_alone_and_the_energy_falls(problem):
     step, x, _ = problem
-    rest = step.simulator.model.garment.mesh.rest
+    rest = step.model.garment.mesh.rest
     before = evaluated(step, x)
-    left = _imbalance(step, before[1]) - _imbalance(step, evaluated(step, rest)[1])
+    left = frame.imbalance(step, before[1]) - frame.imbalance(step, evaluated(step, rest)[1])
     enough = 1e-3 * float(jnp.sum(left))
     after, count = relaxed(step, x, left, enough)
     moved = np.flatnonzero(np.any(np.asarray(after != x), axis=1))
     assert count > 0 and 0 < len(moved) <= SIZE
     found = evaluated(step, after)
     assert found[0] < before[0]
-    imbalance = np.asarray(_imbalance(step, found[1]))
+    imbalance = np.asarray(frame.imbalance(step, found[1]))
     assert imbalance[moved].sum() <= 0.25 * enough
     # what holds too little of the imbalance is left alone
     same, count = relaxed(step, x, left + jnp.max(left), enough)

@@ -6,7 +6,7 @@ import pytest
 from ncs_jax import InputError, io, simulate, simulation
 from ncs_jax.cli import main
 from ncs_jax.scene import load_scene
-from ncs_jax.simulator import CONVERGED
+from ncs_jax.solver.minimise import CONVERGED
 
 from .scenes import SCENE, write_scene
 

@@ -19,7 +19,8 @@ from ncs_jax.kinematics import blend
 from ncs_jax.model import local_rotations, pose_body
 from ncs_jax.objective import Frame, total
 from ncs_jax.scene import load_scene, scene_from
-from ncs_jax.simulator import CONVERGED, LIMIT, NOT_FINITE, Settings, simulate, simulator_from, stepper
+from ncs_jax.simulator import simulate, simulator_from, stepper
+from ncs_jax.solver.minimise import CONVERGED, LIMIT, NOT_FINITE, Settings
 
 from .scenes import grid, post, swing, write_scene
 from .shapes import tube
@@ -177,7 +178,7 @@ def test_single_precision(tmp_path, moved, plain_jax):
     """Near the exact motion, and said to be solved; at 0.003 g, for what is left over 10 frames grows with the tolerance."""
     assembly = sleeve(tmp_path, jnp.float32)
     motion = next(iter(assembly.motions.values()))
-    x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(0.003))
+    x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(tolerance=0.003))
     assert x.dtype == jnp.float32 and solution.residual.dtype == jnp.float32
     assert np.all(np.asarray(solution.status) == CONVERGED)
     np.testing.assert_allclose(np.asarray(x), moved[0], rtol=0, atol=1e-3)

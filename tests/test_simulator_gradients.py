@@ -9,7 +9,8 @@ import pytest
 
 from ncs_jax.assembly import assemble, track_of
 from ncs_jax.scene import load_scene
-from ncs_jax.simulator import CONVERGED, Settings, simulate, simulator_from
+from ncs_jax.simulator import simulate, simulator_from
+from ncs_jax.solver.minimise import CONVERGED, Settings
 
 from .scenes import SCENE, write_scene
 

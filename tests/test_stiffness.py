@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.contact import touching
 from ncs_jax.energies.collision import surface_from
 from ncs_jax.kinematics import skin
 from ncs_jax.mesh import dihedral, mesh_from
 from ncs_jax.objective import MEMBRANES, Frame, Garment, Terms, distances, total
-from ncs_jax.stiffness import couplings_from, multiply, stiffness
+from ncs_jax.solver.contact import touching
+from ncs_jax.solver.stiffness import couplings_from, multiply, stiffness
 
 from .shapes import ball, rotation, sheet, tube
 from .test_objective import material

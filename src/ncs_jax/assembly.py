@@ -217,6 +217,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         bending=jnp.asarray(physics.bending.stiffness, dtype),
         collision=jnp.asarray(physics.collision.stiffness, dtype),
         thickness=jnp.asarray(physics.collision.thickness, dtype),
+        friction=jnp.asarray(physics.collision.friction, dtype),
         pinning=jnp.asarray(physics.pinning.stiffness, dtype),
         gravity=jnp.asarray(physics.gravity, dtype),
     )
@@ -226,6 +227,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         bending=physics.bending.stiffness > 0,
         collision=physics.collision.distance if collides else None,
         exact=physics.collision.search == "exact",
+        friction=collides and physics.inertia and moves and physics.collision.friction > 0,
         gravity=any(physics.gravity),
         inertia=physics.inertia and moves,
         pinning=len(pins) > 0 and physics.pinning.stiffness > 0,

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
 from ncs_jax.energies.membrane import deformation
-from ncs_jax.kinematics import blend
+from ncs_jax.kinematics import blend, skin, unpose
 from ncs_jax.mesh import dihedral
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.numerics import angle_between, norm
-from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.objective import Frame, distances, energies, pressure
 
 __all__ = ["QUANTITIES", "measure", "summarise"]
 
@@ -36,11 +36,15 @@ QUANTITIES = {
 }
 
 
-def _frame(model: Model, exact: bool, x, previous, before, matrices) -> dict[str, Float[Array, ""]]:
+def _frame(model: Model, exact: bool, x, previous, before, matrices, matrices_before) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
     body = None if model.body is None else pose_body(model, matrices)
     blended = blend(matrices, model.blend) if terms.pinning else None
-    frame = Frame(1 / model.fps, previous, before, body, blended)
+    carried = pressed = None
+    if terms.friction:
+        carried = skin(blend(matrices, model.blend), unpose(blend(matrices_before, model.blend), previous))
+        pressed = pressure(carried, body, model.surface, terms, model.material)
+    frame = Frame(1 / model.fps, previous, before, body, blended, carried, pressed)
 
     def value(x):
         parts = energies(x, model.garment, model.material, frame, terms, model.surface)
@@ -76,8 +80,8 @@ def _frame(model: Model, exact: bool, x, previous, before, matrices) -> dict[str
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _measure(model, exact, now, previous, before, matrices):
-    return lax.map(lambda frame: _frame(model, exact, *frame), (now, previous, before, matrices))
+def _measure(model, exact, *frames):
+    return lax.map(lambda frame: _frame(model, exact, *frame), frames)
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_balance": np.median}
@@ -103,7 +107,7 @@ def measure(
     def block(first):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
         three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
-        return jax.device_get(_measure(model, exact, *three, track.matrices[t]))
+        return jax.device_get(_measure(model, exact, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)]))
 
     first, *others = range(0, frames, BLOCK)
     blocks = [block(first)]  # compiles

@@ -24,6 +24,7 @@ from ncs_jax.energies.collision import (
     triangle_distance,
     vertex_normals,
 )
+from ncs_jax.energies.friction import friction
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.mass_spring import mass_spring
@@ -34,7 +35,7 @@ from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import Mesh
 
-__all__ = ["DENSITIES", "MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "total"]
+__all__ = ["DENSITIES", "MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "pressure", "total"]
 
 MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
     "stvk": (stvk, ("lam", "mu")),
@@ -58,6 +59,7 @@ class Terms:
     bending: bool = True
     collision: str | None = "plane"  # "plane", "smooth", "triangle" or None
     exact: bool = True  # exact search; otherwise candidates alone
+    friction: bool = False
     gravity: bool = True
     inertia: bool = True
     pinning: bool = False
@@ -73,6 +75,7 @@ class Material:
     bending: Float[Array, ""]  # N m
     collision: Float[Array, ""]  # J/m^2 a vertex
     thickness: Float[Array, ""]  # m
+    friction: Float[Array, ""]  # its coefficient
     pinning: Float[Array, ""]  # N/m
     gravity: Float[Array, 3]  # m/s^2
 
@@ -96,6 +99,8 @@ class Frame:
     before: Float[Array, "verts 3"] | None = None  # x_{t-2}
     body: Float[Array, "body 3"] | None = None  # posed
     blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
+    carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
+    pressed: Float[Array, "verts 3"] | None = None  # `pressure` there, N
 
 
 def distances(
@@ -119,6 +124,13 @@ def _collision(x, body, surface, terms, material):
         near = nearby_quadrics(x, body, surface)
         return material.collision * jnp.sum(blended(x, near, surface, material.thickness).shortfall)
     return collision(distances(x, body, surface, terms), material.thickness, material.collision)
+
+
+def pressure(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms, material: Material
+) -> Float[Array, "verts 3"]:
+    """How the body's contact resists: its energy's derivative in N, towards the body."""
+    return jax.grad(_collision)(x, body, surface, terms, material)
 
 
 def energies(
@@ -149,6 +161,9 @@ def energies(
     if terms.collision is not None:
         with jax.named_scope("collision"):
             parts["collision"] = _collision(x, frame.body, surface, terms, material)
+    if terms.friction:
+        with jax.named_scope("friction"):
+            parts["friction"] = friction(x, frame.carried, frame.pressed, material.friction, frame.dt)
     if terms.gravity:
         with jax.named_scope("gravity"):
             parts["gravity"] = gravity(x, mass, material.gravity)

@@ -103,6 +103,7 @@ class CollisionSpec:
     thickness: float = _f(0.004, "distance to keep from the body, m", low=0, high=0.1)
     distance: str = _f("plane", "signed distance to the body", choices=("plane", "smooth", "triangle"))
     search: str = _f("exact", "search for the nearest feature", choices=("exact", "candidates"))
+    friction: float = _f(0.0, "coefficient of friction between garment and body; 0: none", low=0, high=10)
     reach: float = _f(0.08, "how near to the skinned garment the body can be touched, m", low=0.005, high=10)
 
 
@@ -156,9 +157,11 @@ class TrainingSpec:
 class SimulationSpec:
     """[simulation]: how `ncs simulate` solves a frame."""
 
+    solver: str = _f("newton", "newton for accuracy, quasi_newton for speed", choices=("newton", "quasi_newton"))
     tolerance: float = _f(0.0, "out-of-balance acceleration, g; 0: 0.1 in float32, 0.001 in float64", low=0, high=1e6)
     iterations: int = _f(100, "most iterations a step", low=1, high=1_000_000)
     substeps: int = _f(1, "steps a frame", low=1, high=1000)
+    pins: str = _f("springs", "what holds the pins", choices=("springs", "exact"))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.errors import InputError
 from ncs_jax.io.npz import read_npz, write_npz
 from ncs_jax.scene import Scene, load_scene
-from ncs_jax.simulator import Settings, Simulator, Solution, State, simulator_from, stepper
+from ncs_jax.simulator import Simulator, State, simulator_from, stepper
+from ncs_jax.solver.minimise import Settings, Solution
 
 __all__ = ["Progress", "Trajectory", "simulate"]
 
@@ -91,7 +92,9 @@ def simulate(
     model = assembly.model
     records = [] if name is None else [load_motion(lone, name, assembly.body)]
     matrices = (track_of(model, *records) if records else assembly.track).matrices
-    settings = Settings(tolerance=spec.tolerance or None, iterations=spec.iterations, inertia=scene.physics.inertia)
+    settings = Settings(
+        spec.solver, spec.tolerance or None, spec.iterations, inertia=scene.physics.inertia, exact_pins=spec.pins == "exact"
+    )
     simulator = simulator_from(model)
     state = stepper(simulator, settings).init()
     frames = 1 + (len(matrices) - 1) // spec.substeps

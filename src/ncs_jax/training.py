@@ -18,7 +18,7 @@ from ncs_jax.methods.ncs import NCS, decode, garment_blend, initial_parameters, 
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
-from ncs_jax.objective import Frame, distances, energies
+from ncs_jax.objective import Frame, distances, energies, pressure
 from ncs_jax.scene import TrainingSpec
 
 __all__ = [
@@ -97,13 +97,17 @@ def _sample(model: Model, weights: Blend, offsets, matrices, inertia_share):
     previous = before = None
     if model.terms.inertia:
         previous, before = (skin(blend(matrices[k], weights), rest + offsets[k]) for k in (1, 2))
+    carried = pressed = None
+    if model.terms.friction:
+        carried = skin(blend(matrices[0], weights), rest + offsets[1])
+        pressed = pressure(carried, body, model.surface, model.terms, model.material)
 
     def value(last, weights):
         blended = blend(matrices[0], weights)
-        frame = Frame(1 / model.fps, previous, before, body, blended)
+        frame = Frame(1 / model.fps, previous, before, body, blended, carried, pressed)
         parts = energies(skin(blended, rest + last), model.garment, model.material, frame, model.terms, model.surface)
         if model.terms.inertia:
-            parts["inertia"] = parts["inertia"] * inertia_share
+            parts |= {name: parts[name] * inertia_share for name in ("inertia", "friction") if name in parts}
         return sum(parts.values()), parts
 
     return value

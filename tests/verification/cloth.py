@@ -25,6 +25,7 @@ def material(membrane=(), bending=0.0, gravity=(0.0, -GRAVITY, 0.0), collision=0
         bending=array(bending),
         collision=array(collision),
         thickness=array(thickness),
+        friction=array(0.0),
         pinning=array(0.0),
         gravity=array(gravity),
     )

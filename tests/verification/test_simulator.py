@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ncs_jax.objective import Frame, total
-from ncs_jax.simulator import CONVERGED, stepper
+from ncs_jax.simulator import stepper
+from ncs_jax.solver.minimise import CONVERGED
 
 from ..shapes import rotation
 from ..test_simulator import SETTINGS, TOLERANCE, advance, loose, thrown

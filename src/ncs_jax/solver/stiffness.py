@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.friction import SLIP, slipping
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.mesh import Mesh, dihedral
 from ncs_jax.numerics import norm, normalize, positive_part
@@ -127,6 +128,16 @@ def _bending(x, mesh: Mesh, stiffness):
     return gradient, jnp.where(solid, 2 * stiffness * mesh.hinge_length**2 / (8 * jnp.sum(areas, axis=-1)), 0)
 
 
+def _friction(x, frame: Frame, coefficient):
+    """The blocks (verts, 3, 3) of friction, which is convex."""
+    along, normal = slipping(x, frame.carried, frame.pressed)
+    length, slip = norm(along), SLIP * frame.dt
+    within = jnp.eye(3, dtype=x.dtype)[None] - normal[:, :, None] * normal[:, None, :]
+    way = jnp.where((length < slip)[:, None], 0, normalize(along))
+    push = coefficient * norm(frame.pressed) / jnp.maximum(length, slip)
+    return push[:, None, None] * (within - way[:, :, None] * way[:, None, :])
+
+
 def stiffness(
     x: Float[Array, "verts 3"],
     couplings: Couplings,
@@ -172,6 +183,8 @@ def stiffness(
         off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
     if contact is not None:
         diagonal = diagonal + contact
+    if terms.friction:
+        diagonal = diagonal + _friction(x, frame, material.friction)
     if terms.pinning:
         pins = garment.pins
         linear = frame.blended[pins][..., :3]

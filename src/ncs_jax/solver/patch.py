@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.model import Model
-from ncs_jax.stiffness import Couplings
+from ncs_jax.solver.stiffness import Couplings
 
 __all__ = ["SIZE", "Patch", "patch_around", "solve_dense"]
 

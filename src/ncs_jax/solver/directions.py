@@ -1,0 +1,92 @@
+"""Which way down: projected Newton, with a new factor at every place, and quasi-Newton, which learns from where it has been.
+
+A direction is made at the start of a frame, `begin(problem, x, point) -> memory`, and asked at every place,
+`along(problem, x, point, memory) -> (p, memory)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ncs_jax.solver.cholesky import solve
+from ncs_jax.solver.problem import dot, factored
+
+__all__ = ["DIRECTIONS", "Direction"]
+
+MEMORY = 8  # steps that quasi-Newton remembers
+REFRESH = 12  # steps after which it takes a new factor
+
+
+@dataclass(frozen=True)
+class Direction:
+    """How a solver finds its way, and whether patches find their own equilibrium between its steps."""
+
+    begin: Callable
+    along: Callable
+    patches: bool
+
+
+def _newton(problem, x, point, memory):
+    """-H^-1 g, H with element Hessians made positive semi-definite (Teran et al. 2005)."""
+    return -solve(problem.order, factored(problem, x, point.contact), point.gradient), memory
+
+
+class _Memory(NamedTuple):
+    """Of L-BFGS: a factor, the steps since it was made, newest first, how the gradient changed with each, their 1/(s . y)."""
+
+    factor: tuple
+    steps: jax.Array
+    changes: jax.Array
+    weights: jax.Array  # zero: nothing there
+    taken: jax.Array
+    x: jax.Array
+    gradient: jax.Array
+
+
+def _fresh(problem, x, point) -> _Memory:
+    none = jnp.zeros((MEMORY, *x.shape), x.dtype)
+    factor = factored(problem, x, point.contact)
+    return _Memory(factor, none, none, jnp.zeros(MEMORY, x.dtype), jnp.zeros((), jnp.int32), x, point.gradient)
+
+
+def _remembered(memory: _Memory, x, gradient) -> _Memory:
+    step, change = x - memory.x, gradient - memory.gradient
+    product = dot(step, change)
+    # a step along which the energy is not convex teaches nothing
+    good = product > jnp.finfo(x.dtype).eps * jnp.sqrt(dot(step, step) * dot(change, change))
+    weight = jnp.where(good, 1 / jnp.where(good, product, 1), 0)
+
+    def pushed(table, new):
+        return jnp.where(good, jnp.concatenate([new[None], table[:-1]]), table)
+
+    return _Memory(
+        memory.factor, pushed(memory.steps, step), pushed(memory.changes, change), pushed(memory.weights, weight),
+        memory.taken + 1, x, gradient,
+    )  # fmt: skip
+
+
+def _quasi_newton(problem, x, point, memory):
+    """L-BFGS (Nocedal and Wright, algorithm 7.4) whose first matrix is Newton's at the last refresh (Liu et al. 2017)."""
+    memory = _remembered(memory, x, point.gradient)
+    memory = lax.cond(memory.taken % REFRESH == 0, lambda: _fresh(problem, x, point), lambda: memory)
+    q, shares = point.gradient, []
+    for k in range(MEMORY):
+        share = memory.weights[k] * dot(memory.steps[k], q)
+        q = q - share * memory.changes[k]
+        shares.append(share)
+    p = solve(problem.order, memory.factor, q)
+    for k in reversed(range(MEMORY)):
+        p = p + memory.steps[k] * (shares[k] - memory.weights[k] * dot(memory.changes[k], p))
+    return -p, memory
+
+
+DIRECTIONS = {
+    "newton": Direction(lambda problem, x, point: None, _newton, patches=True),
+    "quasi_newton": Direction(_fresh, _quasi_newton, patches=False),
+}

@@ -1,0 +1,96 @@
+"""A frame's equilibrium as a differentiable function of all that it depends on, by the implicit function theorem."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.solver.cholesky import solve
+from ncs_jax.solver.minimise import Settings, Solution, minimise
+from ncs_jax.solver.problem import Problem, dot, energy, factored, placed, touched
+
+__all__ = ["equilibrium"]
+
+
+def equilibrium(
+    settings: Settings, problem: Problem, start: Float[Array, "verts 3"]
+) -> tuple[Float[Array, "verts 3"], Solution]:
+    """`minimise`, whose derivative is that of the minimum itself and not of the way to it.
+
+    Where grad E(x, s) = 0, the implicit function theorem gives dx/ds = -H^-1 d(grad E)/ds with the exact Hessian H; in
+    reverse one solve with H for a cotangent, by conjugate gradients that the factored approximation of H preconditions.
+    What exact pins hold moves with them, and H is that of the rest.
+    """
+    leaves, tree = jax.tree.flatten(problem)
+    smooth = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves)  # topology has no derivative
+    numbers = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if is_smooth]
+    topology = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if not is_smooth]
+    return _implicit((settings, tree, smooth), numbers, topology, start)
+
+
+def _joined(static, numbers, topology) -> Problem:
+    _, tree, smooth = static
+    numbers, topology = iter(numbers), iter(topology)
+    return jax.tree.unflatten(tree, [next(numbers if is_smooth else topology) for is_smooth in smooth])
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _implicit(static, numbers, topology, start):
+    return minimise(static[0], _joined(static, numbers, topology), start)
+
+
+def _implicit_forward(static, numbers, topology, start):
+    x, solution = _implicit(static, numbers, topology, start)
+    return (x, solution), (numbers, topology, x)
+
+
+def _implicit_backward(static, kept, cotangents):
+    numbers, topology, x = kept
+    along, _ = cotangents
+    problem = _joined(static, numbers, topology)
+    free = jnp.ones(len(x), x.dtype) if problem.free is None else problem.free.astype(x.dtype)
+
+    def balance(numbers, x):
+        problem = _joined(static, numbers, topology)
+        x = placed(problem, x)
+        return jax.grad(energy, argnums=1)(problem, x) * free[:, None], x
+
+    _, hessian = jax.linearize(lambda x: balance(numbers, x)[0], x)
+    factor = factored(problem, x, touched(problem, x))
+    adjoint = _conjugate_gradients(hessian, lambda r: solve(problem.order, factor, r), along * free[:, None])
+    _, back = jax.vjp(lambda numbers: balance(numbers, x), numbers)
+    (result,) = back((-adjoint, along))
+    return result, None, None
+
+
+_implicit.defvjp(_implicit_forward, _implicit_backward)
+
+
+def _conjugate_gradients(matrix: Callable, preconditioner: Callable, right: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """x with matrix(x) = right to nearly the rounding of the type; ends early where the matrix is not positive definite."""
+    tolerance = 1e-6 if right.dtype == jnp.float32 else 1e-12
+    most = 1000
+
+    def unfinished(state):
+        _, r, _, rho, count, definite = state
+        return (jnp.sqrt(dot(r, r)) > tolerance * jnp.sqrt(dot(right, right))) & (count < most) & definite & (rho > 0)
+
+    def iterate(state):
+        x, r, p, rho, count, _ = state
+        image = matrix(p)
+        curvature = dot(p, image)
+        definite = curvature > 0
+        size = jnp.where(definite, rho / jnp.where(definite, curvature, 1), 0)
+        x, r = x + size * p, r - size * image
+        z = preconditioner(r)
+        new = dot(r, z)
+        return x, r, z + new / rho * p, new, count + 1, definite
+
+    z = preconditioner(right)
+    state = (jnp.zeros_like(right), right, z, dot(right, z), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    return lax.while_loop(unfinished, iterate, state)[0]
