@@ -1,4 +1,4 @@
-"""Sparse Cholesky factorisation of matrices with one 3x3 block a pair of coupled vertices, by nested dissection.
+"""Sparse Cholesky factorisation of matrices with one small block a pair of coupled vertices, by nested dissection.
 
 A garment's couplings never change, so the order of elimination is found once; the numbers then pass through dense fronts
 (Duff and Reid 1983), one batch of equal fronts a level of the dissection tree. All of it is batched matrix products and small
@@ -228,40 +228,40 @@ def _groups(pivots: list[int], border: list[int], most: int = 3) -> list[list[in
 # --- numbers --------------------------------------------------------------------------------------------------------
 
 
-def _triple(index: Array) -> Array:
+def _scalars(index: Array, size: int) -> Array:
     """Rows of scalars of rows of blocks."""
-    return jnp.stack([3 * index, 3 * index + 1, 3 * index + 2], axis=-1).reshape(*index.shape[:-1], -1)
+    return jnp.stack([size * index + i for i in range(size)], axis=-1).reshape(*index.shape[:-1], -1)
 
 
-def factorise(order: Elimination, diagonal: Float[Array, "verts 3 3"], off: Float[Array, "pairs 3 3"]) -> Factor:
-    """Factor a symmetric positive definite matrix; NaN where it is not."""
-    dtype = diagonal.dtype
+def factorise(order: Elimination, diagonal: Float[Array, "verts k k"], off: Float[Array, "pairs k k"]) -> Factor:
+    """Factor a symmetric positive definite matrix of blocks of any one size; NaN where it is not."""
+    dtype, k = diagonal.dtype, diagonal.shape[-1]
     inverses, borders = [], []
     updates = None
     token = jnp.zeros((), dtype)
-    padded = jnp.concatenate([diagonal, jnp.eye(3, dtype=dtype)[None]])
+    padded = jnp.concatenate([diagonal, jnp.eye(k, dtype=dtype)[None]])
     for level in order.levels:
         widest = max(g.border.shape[1] for g in level)
         count = sum(len(g.pivots) for g in level)
-        left = jnp.zeros((count, 3 * (widest + 1), 3 * (widest + 1)), dtype)
+        left = jnp.zeros((count, k * (widest + 1), k * (widest + 1)), dtype)
         first = 0
         for group in level:
             fronts, p = group.pivots.shape
             b = group.border.shape[1]
             # One group after the other: LAPACK, called from two threads at once, hangs XLA's CPU client (jaxlib 0.10).
-            rows = _entered(group, None if updates is None else _taken(group, updates, 0, p, 0), padded + 0 * token, off)
+            rows = _entered(group, None if updates is None else _taken(group, updates, k, 0, p, 0), padded + 0 * token, off)
             # LAPACK reads by columns: of a symmetric matrix the transpose is the same one without a copy.
-            lower = jnp.linalg.cholesky(jnp.swapaxes(rows[:, :, : 3 * p], 1, 2), symmetrize_input=False)
-            eye = jnp.broadcast_to(jnp.eye(3 * p, dtype=dtype), lower.shape)
+            lower = jnp.linalg.cholesky(jnp.swapaxes(rows[:, :, : k * p], 1, 2), symmetrize_input=False)
+            eye = jnp.broadcast_to(jnp.eye(k * p, dtype=dtype), lower.shape)
             inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-            row = jnp.einsum("fij,fjb->fib", inverse, rows[:, :, 3 * p :], precision="highest")
+            row = jnp.einsum("fij,fjb->fib", inverse, rows[:, :, k * p :], precision="highest")
             inverses.append(inverse)
             borders.append(row)
             if b:
                 token = row[0, 0, 0] if p else token
                 update = -jnp.einsum("fpa,fpb->fab", row, row, precision="highest")
                 if updates is not None:
-                    update = _taken(group, updates, p, p + b, p) + update
+                    update = _taken(group, updates, k, p, p + b, p) + update
                 left = lax.dynamic_update_slice(left, update, (first, 0, 0))
             first += fronts
         updates = lax.optimization_barrier(left)
@@ -269,43 +269,51 @@ def factorise(order: Elimination, diagonal: Float[Array, "verts 3 3"], off: Floa
 
 
 def _entered(group: Group, rows, diagonal, off):
-    """Add the blocks of the matrix that enter at a group's fronts to the rows of their pivots, (fronts, 3 pivots, 3 local)."""
-    fronts, p = group.pivots.shape
+    """Add the blocks of the matrix that enter at a group's fronts to the rows of their pivots, (fronts, k pivots, k local)."""
+    (fronts, p), k = group.pivots.shape, off.shape[-1]
     m = p + group.border.shape[1]
-    rows = (jnp.zeros((fronts, 3 * p, 3 * m), off.dtype) if rows is None else rows).reshape(fronts, p, 3, m, 3)
+    rows = (jnp.zeros((fronts, k * p, k * m), off.dtype) if rows is None else rows).reshape(fronts, p, k, m, k)
     if group.blocks.shape[0]:
         blocks = off[group.blocks]
         blocks = jnp.where(group.flipped[:, None, None] == 1, blocks, jnp.swapaxes(blocks, -1, -2))
         f, late, early = group.places.T
         rows = rows.at[f, early, :, late, :].add(blocks, mode="promise_in_bounds", unique_indices=True)
-    k = jnp.arange(p)
-    rows = rows.at[:, k, :, k, :].add(jnp.moveaxis(diagonal[group.pivots], 1, 0), unique_indices=True)
-    return rows.reshape(fronts, 3 * p, 3 * m)
+    own = jnp.arange(p)
+    rows = rows.at[:, own, :, own, :].add(jnp.moveaxis(diagonal[group.pivots], 1, 0), unique_indices=True)
+    return rows.reshape(fronts, k * p, k * m)
 
 
-def _taken(group: Group, updates, top, bottom, left):
+def _taken(group: Group, updates, k, top, bottom, left):
     """The sum of what the two children of every front leave to its rows from `top` to `bottom`, its columns from `left` on."""
     size = updates.shape[-1]
-    rows = _triple(group.children[:, :, top:bottom])
-    columns = _triple(group.columns[:, :, left:])
+    rows = _scalars(group.children[:, :, top:bottom], k)
+    columns = _scalars(group.columns[:, :, left:], k)
     taken = updates.reshape(-1).at[rows[..., :, None] * size + columns[..., None, :]].get(mode="promise_in_bounds")
     taken = lax.optimization_barrier(taken)
     return taken[:, 0] + taken[:, 1]
 
 
-def solve(order: Elimination, factor: Factor, right: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
-    """x with A x = right."""
-    x = jnp.concatenate([right, jnp.zeros((1, 3), right.dtype)])
+def solve(order: Elimination, factor: Factor, right: Float[Array, "verts n"]) -> Float[Array, "verts n"]:
+    """x with A x = right; where the blocks are numbers, of each of the n columns by itself."""
     groups = [g for level in order.levels for g in level]
+    k = sum(inverse.shape[1] for inverse in factor.inverse) // sum(g.pivots.shape[1] for g in groups)
+    columns = right.shape[1] // k
+    x = jnp.concatenate([right, jnp.zeros_like(right[:1])])
+
+    def product(equation, a, b):
+        return jnp.einsum(equation, a, b, precision="highest")
+
+    def rows(index):
+        return x[index].reshape(len(index), k * index.shape[1], columns)
+
     halves = []
     for group, inverse, row in zip(groups, factor.inverse, factor.border, strict=True):
-        y = jnp.einsum("fij,fj->fi", inverse, x[group.pivots].reshape(len(group.pivots), -1), precision="highest")
-        down = jnp.einsum("fpb,fp->fb", row, y, precision="highest")
-        x = x.at[group.border].add(-down.reshape(*group.border.shape, 3))
+        y = product("fij,fjn->fin", inverse, rows(group.pivots))
+        down = product("fpb,fpn->fbn", row, y)
+        x = x.at[group.border].add(-down.reshape(*group.border.shape, right.shape[1]))
         halves.append(y)
     for group, inverse, row, y in zip(groups[::-1], factor.inverse[::-1], factor.border[::-1], halves[::-1], strict=True):
-        above = x[group.border].reshape(len(group.border), -1)
-        y = y - jnp.einsum("fpb,fb->fp", row, above, precision="highest")
-        z = jnp.einsum("fij,fi->fj", inverse, y, precision="highest")
-        x = x.at[group.pivots].set(z.reshape(*group.pivots.shape, 3)).at[-1].set(0)
+        y = y - product("fpb,fbn->fpn", row, rows(group.border))
+        z = product("fij,fin->fjn", inverse, y)
+        x = x.at[group.pivots].set(z.reshape(*group.pivots.shape, right.shape[1])).at[-1].set(0)
     return x[:-1]
