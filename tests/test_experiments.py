@@ -27,6 +27,7 @@ def test_seeds(tmp_path, capsys):
     assert seeds.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
+@pytest.mark.slow  # nearly all of it is compiling
 def test_fit_material(tmp_path, capsys):
     command = ["--cloth", "hanging", "--side", "6", "--frames", "4", "--noise", "0", "--out", str(tmp_path)]
     assert fit_material.main(command) == 0
