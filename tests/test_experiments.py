@@ -6,7 +6,7 @@ import json
 import pytest
 
 from benchmarks import training
-from experiments import seeds
+from experiments import fit_material, seeds
 
 from .scenes import write_scene
 
@@ -25,6 +25,19 @@ def test_seeds(tmp_path, capsys):
     assert (out / "seeds.png").read_bytes()[:4] == b"\x89PNG"
     assert "dropped 0" in capsys.readouterr().out
     assert seeds.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+@pytest.mark.slow  # nearly all of it is compiling
+def test_fit_material(tmp_path, capsys):
+    command = ["--cloth", "hanging", "--side", "6", "--frames", "4", "--noise", "0", "--out", str(tmp_path)]
+    assert fit_material.main(command) == 0
+    with (tmp_path / "fit_material.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["cloth"] == "hanging" and row["failed"] == "0" and int(row["evaluations"]) > 1
+    assert all(abs(float(row[name]) - 1) < 0.05 for name in ("stretch", "bending", "density"))
+    assert (tmp_path / "fit_material.png").read_bytes()[:4] == b"\x89PNG"
+    assert "stretch 5.0000  bending 0.2000  density 5.0000" in capsys.readouterr().out
+    assert fit_material.main(["--cloth", "tshirt", "--frames", "1000", "--out", str(tmp_path)]) == 2
 
 
 def test_training_benchmark(tmp_path, capsys):
