@@ -294,12 +294,13 @@ def test_the_garment_rests_at_rest():
 
 
 def test_the_energy_has_no_steps():
-    """Two sheets slide over and through each other: in one of a thousand steps nothing changes by more than the slope."""
-    rest, x, faces = poses()["sheets 2 mm apart"]
-    mesh = mesh_from(rest, faces, dtype=jnp.float64)
+    """Two sheets slide over and through each other: where it changes most abruptly, it is no steeper than springs."""
+    x, faces = two(5, 5)
+    half = len(x) // 2
+    mesh = mesh_from(x + (np.arange(len(x)) >= half)[:, None], faces, dtype=jnp.float64)
     groups = groups_from(mesh)
     move = np.zeros_like(x)
-    move[81:] = [0.008, 0.003, -0.0045]
+    move[half:] = [0.008, 0.003, -0.0045]
 
     @jax.jit
     def value(t):
@@ -307,15 +308,16 @@ def test_the_energy_has_no_steps():
         pairs = nearby_pairs(there, mesh, groups, EPS)
         return self_contact(there, pairs, EPS, K), jnp.sum(pairs.rest > 0), pairs.overflow
 
-    path = np.linspace(0, 1, 1001)
+    path = np.linspace(0, 1, 101)
     values, counts, overflow = jax.lax.map(value, jnp.asarray(path))
     assert not overflow.any()
-    speed = np.linalg.norm(move[-1])
-    steepest = 2 * K * EPS * speed * float(counts.max())
-    assert np.abs(np.diff(values)).max() <= steepest * 1e-3
     assert len(np.unique(np.asarray(counts))) > 20  # pairs come and go on the way
-    # a step of one pair at the end of its reach, as clamping by classes would make, is k eps^2
-    assert np.abs(np.diff(values, 2)).max() < K * EPS**2
+    abrupt = np.argsort(-np.abs(np.diff(values, 2)))[:2, None] + np.array([[0, 1]])
+    finer = path[abrupt.reshape(-1, 1)] + np.linspace(0, 1, 201) / 100
+    steps = np.diff(np.asarray(jax.lax.map(value, jnp.asarray(finer.reshape(-1)))[0]).reshape(finer.shape), axis=1)
+    # all pairs at once may pull with 2 k eps, and the one that comes or goes with a step would make one of up to k eps^2
+    steepest = 2 * K * EPS * np.linalg.norm(move[-1]) * float(counts.max())
+    assert np.abs(steps).max() < steepest / 20_000 < K * EPS**2 / 3
 
 
 @every_dtype
@@ -365,7 +367,7 @@ def test_no_step_that_is_let_through_makes_an_intersection(pose, rng):
             assert not pairs.overflow
             t = compiled("unhindered")(here, p, pairs, radius)
             assert 0 < t <= 1
-            harm += through(here + p, mesh, groups).any()
+            harm += bool(compiled("through")(here + p, mesh, groups)[0].any())
             here = here + t * p
             assert not through(here, mesh, groups).any()
     assert harm > 10  # of the whole moves
@@ -431,5 +433,6 @@ def test_sheets_that_cross_and_a_fold_that_does_not(dtype):
     assert through(jnp.asarray(rest, dtype), bent, groups_from(bent)).sum() == 0
     assert through(jnp.asarray(x, dtype), bent, groups_from(bent)).sum() == 0
     upper = x[:, 2] > 1.5e-3
-    x[upper, 2] += 0.1 * (x[upper, 0] + 0.0003)  # it now slopes down through the lower half, 19.7 mm from the fold
+    x[upper, 2] += 0.1 * (x[upper, 0] + 0.0045)  # it now slopes down through the lower half, 24.5 mm from the fold
+    x[upper, 1] += 3e-4
     assert through(jnp.asarray(x, dtype), bent, groups_from(bent)).sum() == 2 * 8 + 2 * 8

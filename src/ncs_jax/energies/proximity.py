@@ -294,7 +294,8 @@ def nearby_pairs(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups, radius:
         x: (verts, 3) positions in m, a constant to the derivative. mesh, groups: of the garment. radius: in m.
 
     The lists hold two points and six pairs of edges for every vertex: cloth that lies on cloth everywhere, with a radius of a
-    sixth of its edges' length. Where that is not enough, or the cloth is so crumpled that the search itself runs out of room, `overflow` says so.
+    sixth of its edges' length. Where that is not enough, or the cloth is so crumpled that the search itself runs out of room,
+    `overflow` says so.
     """
     x = lax.stop_gradient(x)
     radius = lax.stop_gradient(jnp.asarray(radius, x.dtype))
@@ -330,6 +331,8 @@ def intersecting(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups) -> tupl
     x = lax.stop_gradient(x)
     ends, corners = (x[k].reshape(len(k), -1) for k in (mesh.edges, mesh.faces))
 
+    rounding = 8 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x))  # m: so near to its plane, a point is on no side of a triangle
+
     def keep(i, j):
         p, q = ends[i].T.reshape(2, 3, -1)
         a, b, c = corners[j].T.reshape(3, 3, -1)
@@ -338,7 +341,8 @@ def intersecting(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups) -> tupl
         a, b, c, along = (_minus(k, p) for k in (a, b, c, q))
         around = [_dot(along, _cross(f, g)) for f, g in ((a, b), (b, c), (c, a))]
         inside = (around[0] > 0) & (around[1] > 0) & (around[2] > 0) | (around[0] < 0) & (around[1] < 0) & (around[2] < 0)
-        return inside & ((above > 0) & (below < 0) | (above < 0) & (below > 0))
+        least = rounding * jnp.sqrt(_dot(n, n))
+        return inside & ((above > least) & (below < -least) | (above < -least) & (below > least))
 
     first, second = (mesh.edges, groups.edges), (mesh.faces, groups.faces)
     i, j, found, full = _meeting(x, first, second, jnp.zeros((), x.dtype), _room(len(mesh.edges)))
