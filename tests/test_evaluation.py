@@ -100,7 +100,7 @@ def test_triangles_that_pass_through_each_other(assembly):
     folded = rest.copy()
     right = rest[:, 0] > 0.02
     folded[right, 0] = -rest[right, 0] - 0.013
-    folded[right, 2] += 0.02 - 0.3 * (rest[right, 0] - 0.05)
+    folded[right, 2] += 0.02 - 0.6 * (rest[right, 0] - 0.05)
     x = np.stack([rest, folded, rest])
     assert "self_intersecting" not in measure(model, x, still(model, 3))
     share = measure(model, x, still(model, 3), self_contact=True)["self_intersecting"]

@@ -157,7 +157,7 @@ def edge_weights(corners: Float[Array, "4 3 pairs"]) -> Float[Array, "4 pairs"]:
 
 def separation(corners: Float[Array, "4 3 pairs"], weights: Float[Array, "4 pairs"]) -> Float[Array, "3 pairs"]:
     """From the closest point of the second primitive to that of the first, sum_i w_i x_i in m; the weights add up to zero."""
-    return sum(weights[i, None] * (corners[i] - corners[0]) for i in range(1, 4))
+    return jnp.sum(weights[1:, None] * (corners[1:] - corners[:1]), axis=0)
 
 
 # --- search -------------------------------------------------------------------------------------------------------------
