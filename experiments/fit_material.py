@@ -50,7 +50,8 @@ from ncs_jax.assembly import track_of
 from ncs_jax.io.npz import write_npz
 from ncs_jax.kinematics import blend, skin, unpose
 from ncs_jax.motion import Track
-from ncs_jax.simulator import CONVERGED, Settings, Simulator, simulate, simulator_from, stepper
+from ncs_jax.simulator import Simulator, simulate, simulator_from, stepper
+from ncs_jax.solver.minimise import CONVERGED, Settings
 
 FRAMES = {"hanging": 8, "tshirt": 4}  # by default, of every cloth
 PARAMETERS = ("stretch", "bending", "density")

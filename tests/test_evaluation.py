@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_jax.assembly import assemble, track_of
+from ncs_jax.energies.proximity import groups_from, intersecting
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.scene import load_scene, scene_from
 
@@ -90,6 +91,33 @@ def test_frames_do_not_depend_on_how_many_there_are(assembly, rng):
     for name, values in part.items():
         np.testing.assert_allclose(whole[name][:9], values, rtol=1e-12, atol=1e-12)
     assert all(len(values) == BLOCK + 7 for values in whole.values())
+
+
+def test_triangles_that_pass_through_each_other(assembly):
+    """The sheet as it is; its right columns turned over and pushed through the left ones; only where it is asked for."""
+    model = assembly.model
+    rest = np.asarray(model.garment.mesh.rest)
+    folded = rest.copy()
+    right = rest[:, 0] > 0.02
+    folded[right, 0] = -rest[right, 0] - 0.013
+    folded[right, 2] += 0.02 - 0.6 * (rest[right, 0] - 0.05)
+    x = np.stack([rest, folded, rest])
+    assert "self_intersecting" not in measure(model, x, still(model, 3))
+    share = measure(model, x, still(model, 3), self_contact=True)["self_intersecting"]
+    assert share[0] == share[2] == 0
+    groups = groups_from(model.garment.mesh)
+    through, overflow = jax.jit(intersecting)(jnp.asarray(folded), model.garment.mesh, groups)
+    assert not overflow and through.any()
+    np.testing.assert_allclose(share[1], 100 * np.mean(through), rtol=1e-12)
+
+
+def test_a_scene_with_self_contact_is_asked(tmp_path):
+    model = assembled(tmp_path, self_contact={"stiffness": 10.0, "thickness": 0.002}).model
+    x = np.repeat(np.asarray(model.garment.mesh.rest)[None], 2, axis=0)
+    rows = measure(model, x, still(model, 2))
+    np.testing.assert_array_equal(rows["self_intersecting"], 0)
+    np.testing.assert_array_equal(rows["self_contact"], 0)
+    assert "self_intersecting" not in measure(model, x, still(model, 2), self_contact=False)
 
 
 def test_summary():

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from ncs_jax.energies.collision import surface_from
+from ncs_jax.energies.proximity import groups_from
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import mesh_from
 from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, distances, energies, total
 
 from .shapes import ball, rotation, sheet
 
-ALL = Terms(collision="plane", pinning=True)
-NAMES = ("membrane", "bending", "collision", "gravity", "inertia", "pinning")
+ALL = Terms(collision="plane", pinning=True, self_contact=True)
+NAMES = ("membrane", "bending", "collision", "gravity", "inertia", "pinning", "self_contact")
 OFF = {"membrane": None, "bending": False, "collision": None, "gravity": False, "inertia": False, "pinning": False}
+OFF["self_contact"] = False
 DT = 0.02
 DOWN = (0.0, 0.0, -9.81)
 
@@ -36,6 +38,8 @@ def material(model="stvk", gravity=DOWN):
         friction=array(0.0),
         pinning=array(1000.0),
         gravity=array(gravity),
+        self_contact=array(50.0),
+        self_thickness=array(0.009),  # nearly a spacing, so that what is crumpled is too near
     )
 
 
@@ -47,7 +51,8 @@ def situation():
     rest = rest + np.array([-0.025, -0.02, 0.046])
     body, triangles = ball(2, 0.05)
     x = rest + 1e-3 * rng.normal(size=rest.shape)
-    garment = Garment(mesh_from(rest, faces, dtype=jnp.float64), jnp.array([0, 5], jnp.int32))
+    mesh = mesh_from(rest, faces, dtype=jnp.float64)
+    garment = Garment(mesh, jnp.array([0, 5], jnp.int32), groups_from(mesh))
     turn = np.concatenate([rotation([1, 2, 3], 0.2), [[0.01], [0.0], [0.02]]], axis=1)
     frame = Frame(
         dt=DT,
@@ -134,6 +139,17 @@ def test_a_frame_brings_only_what_is_asked_for(off, lacking):
     assert set(got) == set(NAMES) - set(off)
     for name, value in got.items():
         np.testing.assert_allclose(value, whole[name], rtol=1e-13)
+
+
+def test_too_many_pairs_are_no_number():
+    """Crushed into one point, everything is near everything: more than the lists hold, and not an energy without the rest."""
+    rest, faces = sheet(9, 9, 0.01)
+    mesh = mesh_from(rest, faces, dtype=jnp.float64)
+    garment = Garment(mesh, jnp.zeros(0, jnp.int32), groups_from(mesh))
+    terms = dataclasses.replace(ALL, **{**OFF, "self_contact": True})
+    value = jax.jit(lambda x: total(x, garment, material(), Frame(), terms))
+    assert value(0.8 * mesh.rest) > 0
+    assert jnp.isnan(value(0.001 * mesh.rest))
 
 
 def test_the_total_is_the_sum():
@@ -278,11 +294,11 @@ def test_material_and_time_step_are_differentiated():
     np.testing.assert_allclose(slopes["dt"], -2 * parts["inertia"] / DT, rtol=1e-12)
     by = slopes["material"]
     np.testing.assert_allclose(by.density, (parts["gravity"] + parts["inertia"]) / one.density, rtol=1e-12)
-    for name in ("bending", "collision", "pinning"):
+    for name in ("bending", "collision", "pinning", "self_contact"):
         np.testing.assert_allclose(getattr(by, name), parts[name] / getattr(one, name), rtol=1e-12)
     lam, mu = by.membrane
     np.testing.assert_allclose(lam * one.membrane[0] + mu * one.membrane[1], parts["membrane"], rtol=1e-12)
-    assert by.thickness > 0
+    assert by.thickness > 0 and by.self_thickness > 0
     np.testing.assert_allclose(jnp.vdot(by.gravity, one.gravity), parts["gravity"], rtol=1e-12)
 
 

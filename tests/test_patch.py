@@ -71,8 +71,8 @@ def test_its_solve_is_that_of_the_dense_matrix(problem):
     gradient = evaluated(step, x)[1]
     blocks = partial(jax.jit(frame.blocks, compiler_options=QUICK), x=x)
     local = minimise._on_patch(step, patch)
-    found = jax.jit(solve_dense)(patch, *blocks(local, contact=evaluated(local, x)[2]), gradient)
-    whole = dense(step.couplings, *blocks(step, contact=evaluated(step, x)[2])).reshape(len(x), 3, len(x), 3)
+    found = jax.jit(solve_dense)(patch, *blocks(local, point=evaluated(local, x)), gradient)
+    whole = dense(step.couplings, *blocks(step, point=evaluated(step, x))).reshape(len(x), 3, len(x), 3)
     v = np.asarray(patch.verts)
     right = np.linalg.solve(whole[v][:, :, v].reshape(3 * SIZE, -1), np.asarray(gradient)[v].reshape(-1))
     np.testing.assert_allclose(np.asarray(found)[v].reshape(-1), right, rtol=0, atol=1e-9 * np.abs(right).max())

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from ncs_jax.assembly import assemble
+from ncs_jax.kinematics import blend, skin
+from ncs_jax.objective import Frame, energies
 from ncs_jax.scene import load_scene, scene_from
 from ncs_jax.training import (
     CHUNK,
@@ -149,6 +151,33 @@ def test_a_step_that_is_not_finite_is_dropped_counted_and_named(tmp_path, plain_
     state, _ = run(state, ends, pairs, 100, model, assembly.track)
     assert int(state.dropped) == CHUNK
     assert not all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params), strict=True))
+
+
+def test_cloth_that_comes_too_near_itself_is_pushed_apart(tmp_path, plain_jax):
+    """A sheet folded over itself in unposed space; and a training step of a scene that has self-contact is finite."""
+    changes = {"physics.self_contact.stiffness": 50.0, "physics.self_contact.thickness": 0.02}
+    assembly, spec, ends, pairs = prepared(tmp_path, changes)
+    model = assembly.model
+    rest = np.asarray(model.garment.mesh.rest)
+    fold = np.where(rest[:, :1] > 0.02, -2 * rest[:, :1] * [1, 0, 0] + [0.013, 0.017, 0.01], 0)
+    matrices = assembly.track.matrices[ends[0][0]]
+
+    def value(offsets):
+        x = skin(blend(matrices, model.blend), jnp.asarray(rest, jnp.float32) + offsets)
+        terms = dataclasses.replace(
+            model.terms, membrane=None, bending=False, collision=None, gravity=False, inertia=False, pinning=False
+        )
+        return energies(x, model.garment, model.material, Frame(), terms)["self_contact"]
+
+    offsets = jnp.asarray(fold, jnp.float32)
+    before, slope = jax.jit(jax.value_and_grad(value))(offsets)
+    assert before > 1e-4
+    upper = rest[:, 0] > 0.02
+    assert jnp.sum(slope[upper, 2]) < -1e-3 and jnp.sum(slope[~upper, 2]) > 1e-3  # down the gradient, the halves part
+    params = initial_state(model, assembly.network, 0).params
+    gradient, parts, _ = one_gradient(assembly, spec, params, ends[0], pairs[0])
+    assert parts["self_contact"].shape == (spec.batch,)
+    assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves((gradient, parts)))
 
 
 def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, plain_jax):

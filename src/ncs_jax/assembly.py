@@ -10,6 +10,7 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.energies.collision import surface_from
+from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
 from ncs_jax.kinematics import Skeleton, blend_from
 from ncs_jax.mesh import mesh_from
@@ -211,6 +212,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         body_blend, body_points = blend_from(body_weights[:, kept], dtype=dtype), jnp.asarray(points, dtype)
     membrane = None if physics.membrane.model == "none" else physics.membrane.model
     numbers = tuple(getattr(physics.membrane, n) for n in MEMBRANES[membrane][1]) if membrane else ()
+    keeps_apart = physics.self_contact.stiffness > 0
     material = Material(
         density=jnp.asarray(physics.density, dtype),
         membrane=tuple(jnp.asarray(n, dtype) for n in numbers),
@@ -220,6 +222,8 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         friction=jnp.asarray(physics.collision.friction, dtype),
         pinning=jnp.asarray(physics.pinning.stiffness, dtype),
         gravity=jnp.asarray(physics.gravity, dtype),
+        self_contact=jnp.asarray(physics.self_contact.stiffness, dtype) if keeps_apart else None,
+        self_thickness=jnp.asarray(physics.self_contact.thickness, dtype) if keeps_apart else None,
     )
     moves = bool(prepared.moves)
     terms = Terms(
@@ -231,11 +235,12 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         gravity=any(physics.gravity),
         inertia=physics.inertia and moves,
         pinning=len(pins) > 0 and physics.pinning.stiffness > 0,
+        self_contact=keeps_apart,
     )
     return Model(
         skeleton=skeleton,
         rest_rotations=None if rest_rotations is None else jnp.asarray(rest_rotations[kept], dtype),
-        garment=Garment(mesh, jnp.asarray(pins, jnp.int32)),
+        garment=Garment(mesh, jnp.asarray(pins, jnp.int32), groups_from(mesh) if keeps_apart else None),
         blend=blend_from(prepared.weights[:, kept], dtype=dtype),
         material=material,
         basis=jnp.asarray(prepared.basis, dtype),

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
 from ncs_jax.energies.membrane import deformation
+from ncs_jax.energies.proximity import Groups, groups_from, intersecting
 from ncs_jax.kinematics import blend, skin, unpose
 from ncs_jax.mesh import dihedral
 from ncs_jax.model import Model, pose_body
@@ -32,11 +33,14 @@ QUANTITIES = {
     "hinge_mean": ("deg", "mean |phi - phi_rest| over the hinges"),
     "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
     "depth_max": ("mm", "deepest penetration"),
+    "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
 
 
-def _frame(model: Model, exact: bool, x, previous, before, matrices, matrices_before) -> dict[str, Float[Array, ""]]:
+def _frame(
+    model: Model, exact: bool, groups: Groups | None, x, previous, before, matrices, matrices_before
+) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
     body = None if model.body is None else pose_body(model, matrices)
     blended = blend(matrices, model.blend) if terms.pinning else None
@@ -76,12 +80,15 @@ def _frame(model: Model, exact: bool, x, previous, before, matrices, matrices_be
             depth = -distances(x, body, model.surface, terms)
         result["penetrating"] = 100 * jnp.mean(depth > 0)
         result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
+    if groups is not None:
+        through, overflow = intersecting(x, mesh, groups)
+        result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
     return result
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _measure(model, exact, *frames):
-    return lax.map(lambda frame: _frame(model, exact, *frame), frames)
+def _measure(model, exact, groups, *frames):
+    return lax.map(lambda frame: _frame(model, exact, groups, *frame), frames)
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_balance": np.median}
@@ -90,7 +97,12 @@ BLOCK = 64  # frames measured at once, so that motions of every length share one
 
 
 def measure(
-    model: Model, vertices: Float[Array | np.ndarray, "frames verts 3"], track: Track, *, exact: bool = True
+    model: Model,
+    vertices: Float[Array | np.ndarray, "frames verts 3"],
+    track: Track,
+    *,
+    exact: bool = True,
+    self_contact: bool | None = None,
 ) -> dict[str, np.ndarray]:
     """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
 
@@ -98,16 +110,20 @@ def measure(
         vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
 
         exact: penetration by the exact signed distance to the body's triangles; else by the scene's own query, which is faster.
+        self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
 
     Energies use the scene's own terms. Before its first frame the garment is taken to have been at rest.
     """
     frames = len(vertices)
     positions = np.asarray(vertices)
+    groups = None
+    if model.terms.self_contact if self_contact is None else self_contact:
+        groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups
 
     def block(first):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
         three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
-        return jax.device_get(_measure(model, exact, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)]))
+        return jax.device_get(_measure(model, exact, groups, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)]))
 
     first, *others = range(0, frames, BLOCK)
     blocks = [block(first)]  # compiles

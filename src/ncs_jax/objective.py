@@ -30,6 +30,8 @@ from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.mass_spring import mass_spring
 from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.pinning import pinning
+from ncs_jax.energies.proximity import Groups, nearby_pairs
+from ncs_jax.energies.self_contact import self_contact
 from ncs_jax.energies.smooth_contact import blended, nearby_quadrics
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
@@ -63,6 +65,7 @@ class Terms:
     gravity: bool = True
     inertia: bool = True
     pinning: bool = False
+    self_contact: bool = False
 
 
 @jax.tree_util.register_dataclass
@@ -78,15 +81,18 @@ class Material:
     friction: Float[Array, ""]  # its coefficient
     pinning: Float[Array, ""]  # N/m
     gravity: Float[Array, 3]  # m/s^2
+    self_contact: Float[Array, ""] | None = None  # J/m^2 a pair
+    self_thickness: Float[Array, ""] | None = None  # m
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Garment:
-    """What a garment is to the energies: its mesh, and which vertices are pinned."""
+    """What a garment is to the energies: its mesh, which vertices are pinned, and its groups where there is self-contact."""
 
     mesh: Mesh
     pins: Int[Array, "pins"]
+    groups: Groups | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -133,6 +139,12 @@ def pressure(
     return jax.grad(_collision)(x, body, surface, terms, material)
 
 
+def _self_contact(x, garment, material):
+    pairs = nearby_pairs(x, garment.mesh, garment.groups, material.self_thickness)
+    value = self_contact(x, pairs, material.self_thickness, material.self_contact)
+    return jnp.where(pairs.overflow, jnp.nan, value)
+
+
 def energies(
     x: Float[Array, "verts 3"],
     garment: Garment,
@@ -147,6 +159,7 @@ def energies(
         x: (verts, 3) positions in m. garment, material: what is constant. frame: what this frame brings.
         terms: which terms exist. surface: the touchable body, where there is collision.
 
+    Self-contact is NaN where more pairs are near each other than its lists hold: an energy without some of them would be wrong.
     The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler.
     """
     mesh = garment.mesh
@@ -175,6 +188,9 @@ def energies(
         with jax.named_scope("pinning"):
             pins = garment.pins
             parts["pinning"] = pinning(unpose(frame.blended[pins], x[pins]), mesh.rest[pins], material.pinning)
+    if terms.self_contact:
+        with jax.named_scope("self_contact"):
+            parts["self_contact"] = _self_contact(x, garment, material)
     return parts
 
 

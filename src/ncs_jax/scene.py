@@ -26,6 +26,7 @@ __all__ = [
     "PhysicsSpec",
     "PinningSpec",
     "Scene",
+    "SelfContactSpec",
     "SimulationSpec",
     "TrainingSpec",
     "load_scene",
@@ -108,6 +109,14 @@ class CollisionSpec:
 
 
 @dataclass(frozen=True)
+class SelfContactSpec:
+    """[physics.self_contact]."""
+
+    stiffness: float = _f(0.0, "k_s, J/m^2 a pair; 0: cloth passes through cloth", low=0, high=1e9)
+    thickness: float = _f(0.003, "distance of cloth from cloth, m", low=0, high=0.1, above=True)
+
+
+@dataclass(frozen=True)
 class PinningSpec:
     """[physics.pinning]."""
 
@@ -125,6 +134,7 @@ class PhysicsSpec:
     bending: BendingSpec = _f(BendingSpec, "")
     collision: CollisionSpec = _f(CollisionSpec, "")
     pinning: PinningSpec = _f(PinningSpec, "")
+    self_contact: SelfContactSpec = _f(SelfContactSpec, "")
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,11 @@ from ncs_jax.objective import pressure
 from ncs_jax.solver.cholesky import Elimination, elimination
 from ncs_jax.solver.equilibrium import equilibrium
 from ncs_jax.solver.minimise import Settings, Solution
-from ncs_jax.solver.problem import Problem, look, placed, touched, unhindered, with_body_near
+from ncs_jax.solver.problem import Problem, apart, knowing, look, placed, touched, unhindered
 from ncs_jax.solver.stiffness import Couplings, couplings_from
+
+APPROACH = 8  # safe steps towards where the next frame is sought,
+WORTH = 0.1  # each at least so much of the way
 
 __all__ = ["Simulation", "Simulator", "simulate", "simulator_from", "stepper"]
 
@@ -76,6 +79,26 @@ def _expected(problem: Problem, state: State, carried, blended) -> Float[Array, 
     return lax.stop_gradient(placed(problem, start))
 
 
+def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Array, "verts 3"]):
+    """As far from x to one target after the other as cloth comes without passing through itself; and the problem there."""
+    seen = look(problem, x)
+    for target in targets:
+
+        def unfinished(state):
+            _, t, count, _ = state
+            return (t >= WORTH) & (t < 1) & (count < APPROACH)
+
+        def go(state, target=target):
+            x, _, count, seen = state
+            t = apart(knowing(problem, seen), x, target - x)
+            x = jnp.where(t < 1, jnp.where(t < WORTH, x, x + t * (target - x)), target)
+            return x, t, count + 1, look(problem, x)
+
+        state = (x, jnp.full((), WORTH, x.dtype), jnp.zeros((), jnp.int32), seen)
+        x, _, _, seen = lax.while_loop(unfinished, go, state)
+    return knowing(problem, seen), x
+
+
 def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
     """A simulation frame by frame: pure functions with explicit state, to be jitted by the caller.
 
@@ -110,8 +133,12 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
             carried=carried if model.terms.friction else None,
             pressed=pressed,
         )  # fmt: skip
-        problem = with_body_near(problem, look(problem, carried))
-        x, solution = equilibrium(settings, problem, _expected(problem, state, carried, blended))
+        problem = knowing(problem, look(problem, carried))
+        start = _expected(problem, state, carried, blended)
+        if model.terms.self_contact:
+            last = jnp.where(state.started, placed(problem, state.previous), start)
+            problem, start = _approached(problem, *map(lax.stop_gradient, (last, carried, start)))
+        x, solution = equilibrium(settings, problem, start)
         unposed = unpose(blended, x)
         first = ~state.started
         before = (jnp.where(first, x, state.previous), jnp.where(first, unposed, state.unposed))

@@ -21,6 +21,7 @@ __all__ = [
     "Surface",
     "closest_weights",
     "collision",
+    "compact_groups",
     "face_normals",
     "nearest_groups",
     "nearest_triangle",
@@ -57,7 +58,7 @@ class Surface:
     groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
 
 
-def _blocks(points: np.ndarray, size: int) -> np.ndarray:
+def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
     """Halve the points along their longest extent until no group is larger than `size`; (groups, largest) indices."""
     groups = [np.arange(len(points))]
     while max(len(g) for g in groups) > size:
@@ -80,7 +81,7 @@ def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, smoo
     cloth_size, body_size, groups = (24, 4, 28) if smooth else (40, 40, 12)
     cloth_size = max(8, min(cloth_size, len(cloth) // 64))
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
-    cloth_blocks = _blocks(cloth, cloth_size)
+    cloth_blocks = compact_groups(cloth, cloth_size)
     place = np.zeros(len(cloth), np.int32)
     place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
     edges, sides, _ = topology(faces)
@@ -98,8 +99,8 @@ def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, smoo
         border=jnp.asarray(border),
         cloth_blocks=jnp.asarray(cloth_blocks),
         cloth_place=jnp.asarray(place),
-        vertex_blocks=jnp.asarray(_blocks(body, body_size)),
-        face_blocks=jnp.asarray(_blocks(body[faces].mean(axis=1), body_size)),
+        vertex_blocks=jnp.asarray(compact_groups(body, body_size)),
+        face_blocks=jnp.asarray(compact_groups(body[faces].mean(axis=1), body_size)),
         spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
         groups=groups,
     )

@@ -16,11 +16,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ncs_jax.solver.cholesky import factorise, solve
-from ncs_jax.solver.problem import blocks, dot, factored
+from ncs_jax.energies import self_contact
+from ncs_jax.solver.cholesky import Factor, factorise, solve
+from ncs_jax.solver.conjugate_gradients import conjugate_gradients
+from ncs_jax.solver.problem import blocks, dot
+from ncs_jax.solver.stiffness import multiply
 
 __all__ = ["DIRECTIONS", "Direction"]
 
+FORCING, TURNS = 0.01, 100  # of the conjugate gradients: what is left, and the most steps
 MEMORY = 8  # steps that quasi-Newton remembers
 REFRESH = 20  # steps after which it begins anew
 
@@ -35,14 +39,28 @@ class Direction:
 
 
 def _newton(problem, x, point, memory):
-    """-H^-1 g, H with element Hessians made positive semi-definite (Teran et al. 2005)."""
-    return -solve(problem.order, factored(problem, x, point.contact), point.gradient), memory
+    """-H^-1 g, H with element Hessians made positive semi-definite (Teran et al. 2005).
+
+    Cloth that touches itself couples vertices that no element does: then the rest of the matrix preconditions the whole.
+    """
+    diagonal, off = blocks(problem, x, point)
+    factor = factorise(problem.order, diagonal, off)
+    if point.folds is None:
+        return -solve(problem.order, factor, point.gradient), memory
+    stiff = problem.model.material.self_contact
+    single = self_contact.blocks(point.folds, x, stiff)
+    free = jnp.ones((len(x), 1), x.dtype) if problem.free is None else problem.free[:, None].astype(x.dtype)
+
+    def matrix(p):
+        return multiply(problem.couplings, diagonal - single, off, p) + free * self_contact.product(point.folds, p, stiff)
+
+    return -conjugate_gradients(matrix, lambda r: solve(problem.order, factor, r), point.gradient, FORCING, TURNS), memory
 
 
 class _Memory(NamedTuple):
     """Of L-BFGS: a factor, the steps since it was made, newest first, how the gradient changed with each, their 1/(s . y)."""
 
-    factor: tuple
+    factor: Factor
     steps: jax.Array
     changes: jax.Array
     weights: jax.Array  # zero: nothing there
@@ -58,9 +76,7 @@ def _fresh(problem, x, point) -> _Memory:
     that, does not know which way the cloth lay when the frame began, so it stays good while the cloth turns.
     """
     none = jnp.zeros((MEMORY, *x.shape), x.dtype)
-    traces = [
-        jnp.trace(b, axis1=1, axis2=2)[:, None, None] for b in blocks(problem, problem.model.garment.mesh.rest, point.contact)
-    ]
+    traces = [jnp.trace(b, axis1=1, axis2=2)[:, None, None] for b in blocks(problem, problem.model.garment.mesh.rest, point)]
     factor = factorise(problem.order, *traces)
     return _Memory(factor, none, none, jnp.zeros(MEMORY, x.dtype), jnp.zeros((), jnp.int32), x, point.gradient)
 

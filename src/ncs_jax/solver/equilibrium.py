@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.solver.cholesky import solve
+from ncs_jax.solver.conjugate_gradients import conjugate_gradients
 from ncs_jax.solver.minimise import Settings, Solution, minimise
-from ncs_jax.solver.problem import Problem, dot, energy, factored, placed, touched
+from ncs_jax.solver.problem import Problem, energy, evaluated, factored, placed
 
 __all__ = ["equilibrium"]
 
@@ -61,36 +60,12 @@ def _implicit_backward(static, kept, cotangents):
         return jax.grad(energy, argnums=1)(problem, x) * free[:, None], x
 
     _, hessian = jax.linearize(lambda x: balance(numbers, x)[0], x)
-    factor = factored(problem, x, touched(problem, x))
-    adjoint = _conjugate_gradients(hessian, lambda r: solve(problem.order, factor, r), along * free[:, None])
+    factor = factored(problem, x, evaluated(problem, x))
+    tolerance = 1e-6 if x.dtype == jnp.float32 else 1e-12  # nearly the rounding
+    adjoint = conjugate_gradients(hessian, lambda r: solve(problem.order, factor, r), along * free[:, None], tolerance, 1000)
     _, back = jax.vjp(lambda numbers: balance(numbers, x), numbers)
     (result,) = back((-adjoint, along))
     return result, None, None
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)
-
-
-def _conjugate_gradients(matrix: Callable, preconditioner: Callable, right: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
-    """x with matrix(x) = right to nearly the rounding of the type; ends early where the matrix is not positive definite."""
-    tolerance = 1e-6 if right.dtype == jnp.float32 else 1e-12
-    most = 1000
-
-    def unfinished(state):
-        _, r, _, rho, count, definite = state
-        return (jnp.sqrt(dot(r, r)) > tolerance * jnp.sqrt(dot(right, right))) & (count < most) & definite & (rho > 0)
-
-    def iterate(state):
-        x, r, p, rho, count, _ = state
-        image = matrix(p)
-        curvature = dot(p, image)
-        definite = curvature > 0
-        size = jnp.where(definite, rho / jnp.where(definite, curvature, 1), 0)
-        x, r = x + size * p, r - size * image
-        z = preconditioner(r)
-        new = dot(r, z)
-        return x, r, z + new / rho * p, new, count + 1, definite
-
-    z = preconditioner(right)
-    state = (jnp.zeros_like(right), right, z, dot(right, z), jnp.zeros((), jnp.int32), jnp.asarray(True))
-    return lax.while_loop(unfinished, iterate, state)[0]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.solver.directions import DIRECTIONS
 from ncs_jax.solver.patch import SIZE, Patch, patch_around, solve_dense
-from ncs_jax.solver.problem import Problem, blocks, descended, evaluated, imbalance, look, with_body_near
+from ncs_jax.solver.problem import Problem, blocks, come, descended, evaluated, imbalance, knowing, look, trusted
 
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Solution", "minimise"]
 
@@ -71,7 +71,7 @@ def relaxed(problem: Problem, x: Float[Array, "verts 3"], left: Float[Array, "ve
 
     def iterate(state):
         x, point, count, _ = state
-        p = -solve_dense(patch, *blocks(local, x, point.contact), point.gradient)
+        p = -solve_dense(patch, *blocks(local, x, point), point.gradient)
         x, point, moved = descended(local, x, point, p)
         return x, point, count + 1, moved
 
@@ -96,11 +96,11 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
 
     def iterate(state):
         x, point, memory, seen, _, _, iteration = state
-        here = with_body_near(problem, seen)
+        here = knowing(problem, seen)
         p, memory = direction.along(here, x, point, memory)
         x, point, moved = descended(here, x, point, p)
         status, left = judged(point, ~moved, p)
-        if direction.patches and x.shape[0] > 4 * SIZE:
+        if direction.patches and problem.pairs is None and x.shape[0] > 4 * SIZE:
 
             def relax(x, point):
                 x, count = relaxed(here, x, imbalance(here, point.gradient), mass * (tolerance * STANDARD_GRAVITY) ** 2)
@@ -112,18 +112,17 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         return x, point, memory, seen, status, left, iteration + 1
 
     def looked_again(x, point, seen, status, left):
-        """With the body found anew where a vertex has come far since it was, and before the frame is done in any case."""
+        """With what is near found anew where a vertex has come far since it was, and before the frame is done in any case."""
         if seen is None:
             return point, seen, status, left
 
         def again():
             seen = look(problem, x)
-            point = evaluated(with_body_near(problem, seen), x)
+            point = evaluated(knowing(problem, seen), x)
             return point, seen, *judged(point, status == STALLED, x)
 
-        come = jnp.max(jnp.sum((x - seen[1]) ** 2, axis=-1))
-        far = jnp.where(status == CONVERGED, 0, problem.model.surface.spacing.astype(x.dtype) ** 2)
-        return lax.cond(come > far, again, lambda: (point, seen, status, left))
+        far = jnp.where(status == CONVERGED, 0, trusted(problem, x))
+        return lax.cond(come(x, seen[-1]) > far, again, lambda: (point, seen, status, left))
 
     def judged(point, stuck, p):
         left = jnp.sqrt(jnp.sum(imbalance(problem, point.gradient)) / mass) / STANDARD_GRAVITY
@@ -132,9 +131,9 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
     point = evaluated(problem, start)
-    seen = None if problem.near is None else (problem.near, problem.seen)
+    seen = None if problem.seen is None else (problem.near, problem.pairs, problem.seen)
     point, seen, status, left = looked_again(start, point, seen, *judged(point, False, start))
-    memory = direction.begin(with_body_near(problem, seen), start, point)
+    memory = direction.begin(knowing(problem, seen), start, point)
     state = (start, point, memory, seen, status, left, jnp.zeros((), jnp.int32))
     x, *_, status, left, iterations = lax.while_loop(unfinished, iterate, state)
     return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))

@@ -11,7 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies import self_contact as folds
 from ncs_jax.energies.inertia import inertia
+from ncs_jax.energies.proximity import Pairs, free_share, nearby_pairs
+from ncs_jax.energies.self_contact import Repulsion, repulsion
 from ncs_jax.energies.smooth_contact import Quadrics, nearby_quadrics
 from ncs_jax.model import Model
 from ncs_jax.objective import Frame, energies
@@ -19,11 +22,12 @@ from ncs_jax.solver.cholesky import Elimination, factorise
 from ncs_jax.solver.contact import Contact, touching
 from ncs_jax.solver.stiffness import Couplings, stiffness
 
-__all__ = ["Point", "Problem", "blocks", "descended", "dot", "energy", "evaluated", "factored", "imbalance", "look", "placed",
-           "touched", "unhindered", "with_body_near"]  # fmt: skip
+__all__ = ["Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored", "imbalance",
+           "knowing", "look", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
 LEAST_STEP = 1e-6  # of a step: below it the line search gives up
+REACH = 2  # how far the search for self-contact looks, in thicknesses of the cloth
 
 
 @jax.tree_util.register_dataclass
@@ -41,7 +45,8 @@ class Problem:
     moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     near: Quadrics | None = None  # the body near the garment, where contact is smooth,
-    seen: Float[Array, "verts 3"] | None = None  # as it was found from here
+    pairs: Pairs | None = None  # of cloth near cloth, where it touches itself,
+    seen: Float[Array, "verts 3"] | None = None  # as both were found from here
     carried: Float[Array, "verts 3"] | None = None  # see `Frame`, where there is friction
     pressed: Float[Array, "verts 3"] | None = None
     only: Int[Array, "some"] | None = None  # the vertices whose contact changes, if not all
@@ -68,6 +73,7 @@ class Point(NamedTuple):
     value: Float[Array, ""]  # J
     gradient: Float[Array, "verts 3"]  # N; zero where an exact pin holds
     contact: Contact | None
+    folds: Repulsion | None
 
 
 def dot(a, b):
@@ -78,7 +84,8 @@ def dot(a, b):
 def energy(problem: Problem, x: Float[Array, "verts 3"], **without) -> Float[Array, ""]:
     """What a frame minimises, J; perhaps without some of its terms."""
     model = problem.model
-    terms = replace(model.terms, inertia=False, pinning=model.terms.pinning and problem.pinned is None, **without)
+    held = model.terms.pinning and problem.pinned is None
+    terms = replace(model.terms, **{"inertia": False, "pinning": held, **without})
     parts = energies(x, model.garment, model.material, problem.frame, terms, model.surface)
     value = sum(parts.values(), start=jnp.zeros((), x.dtype))
     if problem.force is not None:
@@ -92,16 +99,39 @@ def placed(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, "verts 
 
 
 def look(problem: Problem, x: Float[Array, "verts 3"]):
-    """The body near the garment, if its contact is smooth, and from where it was seen."""
-    if problem.model.terms.collision != "smooth":
-        return None
-    x, body = lax.stop_gradient(x), lax.stop_gradient(problem.body)
-    return nearby_quadrics(x, body, problem.model.surface), x
+    """The body near the garment, if its contact is smooth; cloth near cloth, if it touches itself; and from where."""
+    model = problem.model
+    x, near, pairs = lax.stop_gradient(x), None, None
+    if model.terms.collision == "smooth":
+        near = nearby_quadrics(x, lax.stop_gradient(problem.body), model.surface)
+    if model.terms.self_contact:
+        pairs = nearby_pairs(x, model.garment.mesh, model.garment.groups, reach(problem))
+    return None if near is None and pairs is None else (near, pairs, x)
 
 
-def with_body_near(problem: Problem, seen) -> Problem:
+def reach(problem: Problem):
+    """How far the search for self-contact looks, m."""
+    return REACH * problem.model.material.self_thickness
+
+
+def trusted(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """How far a vertex may come from where `look` was, m, until what it left out could matter."""
+    far = jnp.asarray(jnp.inf, x.dtype)
+    if problem.model.terms.collision == "smooth":
+        far = problem.model.surface.spacing.astype(x.dtype)
+    if problem.model.terms.self_contact:
+        far = jnp.minimum(far, 0.4 * (reach(problem) - problem.model.material.self_thickness))
+    return far
+
+
+def come(x: Float[Array, "verts 3"], seen: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """How far a vertex has come since."""
+    return jnp.sqrt(jnp.max(jnp.sum((x - seen) ** 2, axis=-1)))
+
+
+def knowing(problem: Problem, seen) -> Problem:
     """The problem that knows what `look` found."""
-    return problem if seen is None else replace(problem, near=seen[0], seen=seen[1])
+    return problem if seen is None else replace(problem, near=seen[0], pairs=seen[1], seen=seen[2])
 
 
 def touched(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None:
@@ -114,13 +144,18 @@ def touched(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None:
 
 def evaluated(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
     """Energy, gradient and contact."""
-    value, gradient = jax.value_and_grad(lambda x: energy(problem, x, collision=None))(x)
-    contact = touched(problem, x)
+    value, gradient = jax.value_and_grad(lambda x: energy(problem, x, collision=None, self_contact=False))(x)
+    contact, found = touched(problem, x), None
     if contact is not None:
         value, gradient = value + contact.energy, gradient + contact.gradient
+    if problem.pairs is not None:
+        material = problem.model.material
+        found = repulsion(x, problem.pairs, material.self_thickness)
+        value = value + jnp.where(problem.pairs.overflow, jnp.nan, folds.energy(found, material.self_contact))
+        gradient = gradient + folds.gradient(found, x, material.self_contact)
     if problem.pinned is not None:
         gradient = jnp.where(problem.free[:, None], gradient, 0)
-    return Point(value, gradient, contact)
+    return Point(value, gradient, contact, found)
 
 
 def imbalance(problem: Problem, gradient: Float[Array, "verts 3"]) -> Float[Array, "verts"]:
@@ -129,24 +164,39 @@ def imbalance(problem: Problem, gradient: Float[Array, "verts 3"]) -> Float[Arra
     return jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / jnp.where(mass > 0, mass, 1), 0)
 
 
-def blocks(problem: Problem, x: Float[Array, "verts 3"], contact: Contact | None):
-    """Blocks of a positive definite approximation of the energy's Hessian."""
+def blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
+    """Blocks of a positive definite approximation of the energy's Hessian; of self-contact those of single vertices."""
     model, terms = problem.model, problem.model.terms
     if problem.pinned is not None:
         terms = replace(terms, pinning=False)
-    touching = None if contact is None else contact.blocks
+    touching = None if point.contact is None else point.contact.blocks
     diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, problem.frame, terms, touching)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
     mass = problem.mass
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / problem.frame.dt**2
     if problem.pinned is not None:
         off = jnp.where(jnp.all(problem.free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
+    if point.folds is not None:
+        diagonal = diagonal + folds.blocks(point.folds, x, model.material.self_contact)
     return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
 
 
-def factored(problem: Problem, x: Float[Array, "verts 3"], contact: Contact | None):
+def factored(problem: Problem, x: Float[Array, "verts 3"], point: Point):
     """Their Cholesky factor."""
-    return factorise(problem.order, *blocks(problem, x, contact))
+    return factorise(problem.order, *blocks(problem, x, point))
+
+
+def apart(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3"]):
+    """The share of the way p on which no part of the cloth can pass through another."""
+    mesh, groups = problem.model.garment.mesh, problem.model.garment.groups
+    left = reach(problem) - 2 * come(x, problem.seen)  # what was not found is at least so far apart
+    share = folds.unhindered(x, p, problem.pairs, jnp.maximum(left, 0))
+
+    def sought():
+        found, full = free_share(x, p, mesh, groups)
+        return jnp.where(full, share, jnp.maximum(found, share))
+
+    return lax.cond(share < 1, sought, lambda: share)
 
 
 def unhindered(contact: Contact | None, p: Float[Array, "verts 3"]):
@@ -173,7 +223,10 @@ def descended(problem: Problem, x: Float[Array, "verts 3"], point: Point, p: Flo
     def at(t):
         return t, evaluated(problem, x + t * p)
 
-    t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(jnp.min(unhindered(point.contact, p))))
+    longest = jnp.min(unhindered(point.contact, p))
+    if problem.pairs is not None:
+        longest = jnp.minimum(longest, apart(problem, x, p))
+    t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(longest))
     moved = t > LEAST_STEP
     point = jax.tree.map(functools.partial(jnp.where, moved), new, point)
     return jnp.where(moved, x + t * p, x), point, moved
