@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from benchmarks import training
+from benchmarks import simulator, training
 from experiments import fit_material, seeds
 
 from .scenes import write_scene
@@ -46,3 +46,13 @@ def test_training_benchmark(tmp_path, capsys):
     assert result["vertices"] == 30 and {"step", "gradient", "yardstick"} <= set(result["seconds"])
     assert all(0 < t["min"] <= t["median"] <= t["max"] for t in result["seconds"].values())
     assert "median" in capsys.readouterr().out
+
+
+@pytest.mark.slow  # nearly all of it is compiling
+def test_benchmark_of_the_simulator(tmp_path, capsys):
+    scene, out = write_scene(tmp_path), tmp_path / "figures.json"
+    assert simulator.main([str(scene), "--frames", "4", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert rows["newton"]["seconds"]["min"] > 0 and rows["quasi_newton"]["iterations"]["max"] <= 12
+    assert "quasi_newton" in capsys.readouterr().out
+    assert simulator.main([str(tmp_path / "nowhere.toml")]) == 2

@@ -21,11 +21,12 @@ FREE = SCENE.replace("body.npz", "none").replace('files = ["swing.npz"]\nvalidat
 PINNED = "[physics]\ngravity = [0.4, -9.81, 1.0]\n[physics.pinning]\nstiffness = 50\n"
 
 
-def scene(tmp_path, contact):
+def scene(tmp_path, contact, friction):
     text = (SCENE if contact else FREE).replace("smoothing = 2", 'smoothing = 2\npins = "pins"') + PINNED
     text = text.replace("modes = 6", "modes = 0")
     if contact:
         text += '[physics.collision]\ndistance = "smooth"\nstiffness = 40\nthickness = 0.006\n'
+        text += f"friction = {friction}\n"
     assembly = assemble(load_scene(write_scene(tmp_path, text)), dtype=jnp.float64)
     model = assembly.model
     if contact:
@@ -35,8 +36,8 @@ def scene(tmp_path, contact):
     return simulator_from(replace(model, moves=True)), jax.tree.map(lambda a: jnp.repeat(a, 5, axis=0), track)
 
 
-def outcome(simulator, track, forces, wanted):
-    x, solution = simulate(simulator, track, TIGHT, forces=forces)
+def outcome(simulator, track, forces, wanted, settings):
+    x, solution = simulate(simulator, track, settings, forces=forces)
     return jnp.sum(wanted * x[1:]), solution
 
 
@@ -58,9 +59,11 @@ def perturbed(simulator, track, forces, name, size, direction):
     return replace(simulator, model=replace(simulator.model, material=changed)), track, forces
 
 
-@pytest.mark.parametrize("contact", [False, True], ids=["hanging", "on the post"])
-def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, contact):
-    simulator, track = scene(tmp_path, contact)
+@pytest.mark.parametrize("kind", ["hanging", "hanging from exact pins", "on the post", "rubbing on the post"])
+def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, kind):
+    contact, rubs, exact = "post" in kind, "rubbing" in kind, "exact" in kind
+    simulator, track = scene(tmp_path, contact, 0.3 if rubs else 0.0)
+    settings = replace(TIGHT, exact_pins=exact)
     shape = (5, *simulator.model.garment.mesh.rest.shape)
     wanted = jnp.asarray(rng.standard_normal((4, *shape[1:])))
     forces = jnp.asarray(1e-4 * rng.standard_normal(shape))
@@ -73,6 +76,10 @@ def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, co
         "forces": jnp.asarray(1e-4 * rng.standard_normal(shape)),
         "pins": jnp.zeros(shape[1:]).at[25:].set(0.01 * rng.standard_normal((5, 3))),
     }
+    if exact:
+        del directions["pinning"]  # no springs hold them
+    if rubs:
+        directions["friction"] = jnp.ones(())
     if contact:
         directions |= {"collision": jnp.ones(()), "thickness": jnp.ones(())}
         directions["body motion"] = jnp.asarray(0.01 * rng.standard_normal(track.matrices.shape))
@@ -82,7 +89,7 @@ def test_gradients_of_a_trajectory_are_its_central_differences(tmp_path, rng, co
         problem = simulator, track, forces
         for (name, direction), size in zip(directions.items(), sizes, strict=True):
             problem = perturbed(*problem, name, size, direction)
-        return outcome(*problem, wanted)
+        return outcome(*problem, wanted, settings)
 
     here = jnp.zeros(len(directions))
     gradient, solution = jax.jit(jax.grad(moved, has_aux=True))(here)

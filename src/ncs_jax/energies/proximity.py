@@ -289,7 +289,7 @@ def _kept(keep, first, second, found, most: int):
 
 def _room(count: int) -> int:
     """For the candidates of so many members."""
-    return -(-CANDIDATES_EACH * count // CHUNK) * CHUNK
+    return -(-max(CANDIDATES_EACH * count, 4 * LEAST) // CHUNK) * CHUNK
 
 
 def nearby_pairs(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups, radius: Float[Array, ""] | float) -> Pairs:
