@@ -30,6 +30,7 @@ from ncs_jax.scene import Scene
 from ncs_jax.simulator import simulator_from, stepper
 from ncs_jax.solver.minimise import CONVERGED, Settings
 
+HERE = Path(__file__).parent
 FAST = Settings("quasi_newton", tolerance=1.0, iterations=12)
 TWICE = (1, 4, 16)  # times as many triangles
 
@@ -82,7 +83,7 @@ def finer(scene: Scene, times: int, folder: Path) -> Scene:
     return replace(scene, garment=replace(scene.garment, file=str(path), pins=""), network=replace(scene.network, modes=0))
 
 
-def benchmark(scene: str | Path = "ncs:tshirt", frames: int = 30, iterations: int = 12, growth: bool = False) -> dict:
+def benchmark(scene: str | Path = HERE / "tshirt.toml", frames: int = 30, iterations: int = 12, growth: bool = False) -> dict:
     """Measure both solvers on a scene, or an iteration of each on ever finer garments."""
     spec = load_scene(scene)
     rows = {}
@@ -110,7 +111,7 @@ def benchmark(scene: str | Path = "ncs:tshirt", frames: int = 30, iterations: in
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
+    parser.add_argument("scene", nargs="?", default=HERE / "tshirt.toml", help="scene file (default: benchmarks/tshirt.toml)")
     parser.add_argument("--frames", type=int, default=30, help="frames of the scene's first motion (default: 30)")
     parser.add_argument("--iterations", type=int, default=12, help="of quasi-Newton; with --growth of both (default: 12)")
     parser.add_argument("--growth", action="store_true", help="one iteration on ever finer garments")
