@@ -78,8 +78,8 @@ def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, smoo
     `smooth`: for `nearby_quadrics`, which takes more and smaller groups; otherwise for the searches, where the sizes were the
     fastest measured with 1,000 and with 4,500 cloth vertices.
     """
-    cloth_size, body_size, groups = (24, 4, 28) if smooth else (40, 40, 12)
-    cloth_size = max(8, min(cloth_size, len(cloth) // 64))
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else (40, 40, 12)
+    cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
     cloth_blocks = compact_groups(cloth, cloth_size)
     place = np.zeros(len(cloth), np.int32)
