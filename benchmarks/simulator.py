@@ -38,16 +38,23 @@ TWICE = (1, 4, 16)  # times as many triangles
 def stream(assembly: Assembly, settings: Settings, frames: int) -> dict:
     """Simulate frame by frame; seconds, iterations and residuals of every frame but the first."""
     simulator = simulator_from(assembly.model)
-    step = jax.jit(lambda simulator, state, matrices: stepper(simulator, settings).follow(state, matrices))
-    state, rows = stepper(simulator, settings).init(), []
-    frames = min(frames, len(assembly.track.matrices))
-    start = time.perf_counter()
-    step.lower(simulator, state, assembly.track.matrices[0]).compile()
+    fixed, kind = jax.tree.flatten(simulator)
+    state, form = jax.tree.flatten(stepper(simulator, settings).init())
+
+    @jax.jit
+    def step(fixed, state, matrices):  # of plain arrays: the classes check their types, which `lower` does not have
+        simulation = stepper(jax.tree.unflatten(kind, fixed), settings)
+        state, _ = simulation.follow(jax.tree.unflatten(form, state), matrices)
+        return jax.tree.leaves(state)
+
+    start, rows = time.perf_counter(), []
+    program = step.lower(fixed, state, assembly.track.matrices[0]).compile()
     compiled = time.perf_counter() - start
+    frames = min(frames, len(assembly.track.matrices))
     for t in range(frames):
         start = time.perf_counter()
-        state, _ = jax.block_until_ready(step(simulator, state, assembly.track.matrices[t]))
-        s = state.solution
+        state = jax.block_until_ready(program(fixed, state, assembly.track.matrices[t]))
+        s = jax.tree.unflatten(form, state).solution
         rows.append((time.perf_counter() - start, int(s.iterations), float(s.residual), int(s.status)))
     first, rest = rows[0], np.array(rows[1:])
     seconds, iterations, residual, status = rest.T
