@@ -13,13 +13,15 @@ from scipy.optimize import lsq_linear, nnls
 from ncs_jax.energies.proximity import (
     corners_of,
     edge_weights,
+    free_share,
     groups_from,
     intersecting,
     nearby_pairs,
     point_weights,
     separation,
+    swept_share,
 )
-from ncs_jax.energies.self_contact import blocks, energy, gradient, product, repulsion, self_contact, unhindered
+from ncs_jax.energies.self_contact import blocks, energy, gradient, product, repulsion, self_contact
 from ncs_jax.mesh import mesh_from
 
 from .shapes import rotation, sheet, tube
@@ -85,7 +87,8 @@ def compiled(name):
         "energy": self_contact,
         "slope": jax.value_and_grad(self_contact),
         "repulsion": repulsion,
-        "unhindered": unhindered,
+        "free": free_share,
+        "swept": swept_share,
     }
     return jax.jit(functions[name])
 
@@ -244,7 +247,8 @@ def test_what_a_newton_step_needs_is_what_the_energy_says(pose, dtype):
     scale = float(jnp.max(jnp.abs(slope)))
     np.testing.assert_allclose(gradient(found, x, K), slope, rtol=0, atol=1e-5 * scale)
     apart = jnp.sum(found.weights[..., None] * x[found.vertices], axis=1)
-    np.testing.assert_allclose(jnp.sum(apart * found.direction, axis=1), found.distance, atol=1e-6 * (1 + float(jnp.max(x))))
+    short = jnp.minimum(jnp.sum(apart * found.direction, axis=1) - jnp.minimum(EPS, pairs.rest), 0)
+    np.testing.assert_allclose(found.shortfall, short, atol=1e-6 * (1 + float(jnp.max(x))))
 
 
 def test_the_product_is_that_of_gauss_and_newton(rng):
@@ -356,7 +360,7 @@ def through(x, mesh, groups):
 def test_no_step_that_is_let_through_makes_an_intersection(pose, rng):
     rest, x, faces = poses()[pose]
     mesh = mesh_from(rest, faces, dtype=jnp.float64)
-    groups, radius, harm = groups_from(mesh), 0.004, 0
+    groups, radius, harm, swept = groups_from(mesh), 0.004, 0, 0
     assert not through(x, mesh, groups).any()
     for trial in range(12):
         here = jnp.asarray(x)
@@ -365,12 +369,16 @@ def test_no_step_that_is_let_through_makes_an_intersection(pose, rng):
             p = jnp.asarray(size * rng.normal(size=x.shape if trial % 2 else (1, 3)) * rng.normal(size=(len(x), 1)))
             pairs = compiled("pairs")(here, mesh, groups, jnp.asarray(radius))
             assert not pairs.overflow
-            t = compiled("unhindered")(here, p, pairs, radius)
-            assert 0 < t <= 1
+            t = compiled("free")(here, p, pairs, radius)
+            wide, full = compiled("swept")(here, p, mesh, groups)
+            assert 0 < t <= 1 and 0 < wide <= 1
+            if not full:  # a way across all cloth sweeps all of it
+                swept += 1
+                assert not through(here + wide * p, mesh, groups).any()
             harm += bool(compiled("through")(here + p, mesh, groups)[0].any())
             here = here + t * p
             assert not through(here, mesh, groups).any()
-    assert harm > 10  # of the whole moves
+    assert harm > 10 and swept > 10  # of the whole moves
 
 
 def test_a_step_is_not_shorter_than_it_must_be():
@@ -380,13 +388,13 @@ def test_a_step_is_not_shorter_than_it_must_be():
     x = jnp.asarray(x)
     pairs = compiled("pairs")(x, mesh, groups_from(mesh), jnp.asarray(0.01))
     down = jnp.zeros_like(x).at[3, 2].set(-1.0)
-    unhindered_ = compiled("unhindered")
-    np.testing.assert_allclose(unhindered_(x, 0.004 * down, pairs, 0.01), 0.9 * 0.003 / 0.004, rtol=1e-12)
-    np.testing.assert_allclose(unhindered_(x, 0.002 * down, pairs, 0.01), 1, rtol=1e-12)
-    np.testing.assert_allclose(unhindered_(x, jnp.full_like(x, 7.0), pairs, 0.01), 1, rtol=1e-12)
+    free = compiled("free")
+    np.testing.assert_allclose(free(x, 0.004 * down, pairs, 0.01), 0.9 * 0.003 / 0.004, rtol=1e-12)
+    np.testing.assert_allclose(free(x, 0.002 * down, pairs, 0.01), 1, rtol=1e-12)
+    np.testing.assert_allclose(free(x, jnp.full_like(x, 7.0), pairs, 0.01), 1, rtol=1e-12)
     nothing = compiled("pairs")(x, mesh, groups_from(mesh), jnp.asarray(0.002))
     assert not np.asarray(nothing.points).any()
-    np.testing.assert_allclose(unhindered_(x, 0.004 * down, nothing, 0.002), 0.9 * 0.002 / 0.004, rtol=1e-12)
+    np.testing.assert_allclose(free(x, 0.004 * down, nothing, 0.002), 0.9 * 0.002 / 0.004, rtol=1e-12)
 
 
 def every_intersection(x, mesh):

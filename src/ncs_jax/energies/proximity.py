@@ -32,6 +32,7 @@ __all__ = [
     "nearby_pairs",
     "point_weights",
     "separation",
+    "swept_share",
 ]
 
 WORD = 32  # members of a group, bits of a word
@@ -326,21 +327,50 @@ def nearby_pairs(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups, radius:
     return Pairs(points, crossings, jnp.concatenate([points_rest, crossings_rest]), full | fuller)
 
 
-def free_share(
+def _free(x, p, vertices, rest, weigh, split: int):
+    """The share of the move p on which each pair stays apart; `split` vertices are its first primitive's.
+
+        t = 0.9 d / max_ij n . (p_j - p_i),   i in the first primitive, j in the second
+
+    Both are convex, so between them lies a slab of width d across n, which cannot shrink faster than the fastest two of their
+    vertices approach along n. Pairs that touch, d = 0, or do in the rest shape, do not hinder. Source: Li et al. 2020, 5 (steps
+    that keep apart), here by separating planes.
+    """
+    at, moves = corners_of(x, vertices), corners_of(p, vertices)
+    gap = separation(at, weigh(at))
+    distance = jnp.sqrt(_dot(gap, gap))
+    along = jnp.sum(moves * gap[None], axis=1)  # times the distance
+    closing = jnp.max(along[split:], axis=0) - jnp.min(along[:split], axis=0)
+    hinders = (closing > 0) & (distance > 0) & (rest > 0)
+    return jnp.where(hinders, 0.9 * distance**2 / jnp.where(hinders, closing, 1), 1)
+
+
+def _relative(p):
+    """Moves without what moves nothing against anything, the middle of their bounding box."""
+    return p - (jnp.min(p, axis=0, keepdims=True) + jnp.max(p, axis=0, keepdims=True)) / 2
+
+
+def free_share(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs, radius) -> Float[Array, ""]:
+    """Largest share t, at most 1, of the move p (m) on whose way no pair can pass through each other.
+
+    The listed pairs by planes between them (see `_free`); all others are `radius` apart (m, of the search that found the
+    pairs), of which no two vertices use up more than 0.9.
+    """
+    p = _relative(p)
+    points, edges = pairs.rest[: len(pairs.points)], pairs.rest[len(pairs.points) :]
+    listed = jnp.concatenate(
+        [_free(x, p, pairs.points, points, point_weights, 1), _free(x, p, pairs.edges, edges, edge_weights, 2)]
+    )
+    far = 2 * jnp.sqrt(jnp.max(jnp.sum(p**2, axis=-1)))
+    return jnp.minimum(jnp.min(listed, initial=1), 0.9 * radius / jnp.maximum(far, 0.9 * radius))
+
+
+def swept_share(
     x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], mesh: Mesh, groups: Groups
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Share t, at most 1, of the move p (m) on whose way no pair can pass through each other; and whether the search that
-    proves it ran out of room.
-
-        t = min(1, 0.9 d / max_ij n . (p_j - p_i))   of all pairs whose ways' boxes overlap,
-
-    with i in the pair's one primitive and j in its other: both are convex, so between them lies a slab of width d across n,
-    which cannot shrink faster than the fastest two of their vertices approach along n. What all vertices have in common, the
-    middle of the moves' bounding box, moves nothing against anything. Pairs that touch, d = 0, or do in the rest shape, do not
-    hinder. Source: Li et al. 2020, 5 (steps that keep apart), here by separating planes.
-    """
-    x, p = lax.stop_gradient(x), lax.stop_gradient(p)
-    p = p - (jnp.min(p, axis=0, keepdims=True) + jnp.max(p, axis=0, keepdims=True)) / 2
+    """As `free_share`, of all pairs whose ways' boxes overlap, however long the way; and whether the search that finds them ran
+    out of room."""
+    x, p = lax.stop_gradient(x), _relative(lax.stop_gradient(p))
 
     def share(first, second, weigh, most):
         i, j, found, full = _meeting(x, first, second, jnp.zeros((), x.dtype), most, x + p)
@@ -351,15 +381,10 @@ def free_share(
             start, least = state
             here, there = (lax.dynamic_slice(k, (start,), (CHUNK,)) for k in (i, j))
             vertices = jnp.concatenate([corners[here], others[there]], axis=1)
-            at, rest, moves = (corners_of(k, vertices) for k in (x, mesh.rest, p))
-            gap = separation(at, weigh(at))
-            distance = jnp.sqrt(_dot(gap, gap))
-            along = jnp.sum(moves * gap[None], axis=1)  # times the distance
-            closing = jnp.max(along[split:], axis=0) - jnp.min(along[:split], axis=0)
+            rest = corners_of(mesh.rest, vertices)
             apart = separation(rest, weigh(rest))
-            hinders = (closing > 0) & (distance > 0) & (_dot(apart, apart) > 0)
-            hinders = hinders & (start + jnp.arange(CHUNK, dtype=jnp.int32) < found)
-            t = jnp.where(hinders, 0.9 * distance**2 / jnp.where(hinders, closing, 1), 1)
+            t = _free(x, p, vertices, _dot(apart, apart), weigh, split)
+            t = jnp.where(start + jnp.arange(CHUNK, dtype=jnp.int32) < found, t, 1)
             return start + CHUNK, jnp.minimum(least, jnp.min(t))
 
         state = (jnp.int32(0), jnp.ones((), x.dtype))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from ncs_jax.energies.proximity import Pairs, corners_of, edge_weights, point_weights, separation
 from ncs_jax.numerics import norm, normalize
 
-__all__ = ["Repulsion", "blocks", "energy", "gradient", "product", "repulsion", "self_contact", "unhindered"]
+__all__ = ["Repulsion", "blocks", "energy", "gradient", "product", "repulsion", "self_contact", "springs"]
 
 
 class Repulsion(NamedTuple):
@@ -25,7 +25,6 @@ class Repulsion(NamedTuple):
     shortfall: Float[Array, "pairs"]  # min(d - eps, 0) in m
     weights: Float[Array, "pairs 4"]  # point and triangle: 1, -a, -b, -c; edge and edge: 1 - s, s, t - 1, -t
     direction: Float[Array, "pairs 3"]  # n, unit; zero where the two touch
-    distance: Float[Array, "pairs"]  # d in m
 
 
 def _apart(x, pairs):
@@ -43,8 +42,7 @@ def _shortfall(distance, pairs, thickness):
 def repulsion(x: Float[Array, "verts 3"], pairs: Pairs, thickness: Float[Array, ""] | float) -> Repulsion:
     """What every pair contributes at x (m), with thickness eps in m; see `self_contact`."""
     vertices, weights, apart = _apart(x, pairs)
-    distance = norm(apart)
-    return Repulsion(vertices, _shortfall(distance, pairs, thickness), weights, normalize(apart), distance)
+    return Repulsion(vertices, _shortfall(norm(apart), pairs, thickness), weights, normalize(apart))
 
 
 def self_contact(
@@ -75,59 +73,31 @@ def energy(found: Repulsion, stiffness: Float[Array, ""] | float) -> Float[Array
     return stiffness * jnp.sum(found.shortfall**2)
 
 
-def _spread(found, along, like):
-    """sum_pairs along w_i n at vertex i."""
-    force = (along[:, None] * found.weights)[..., None] * found.direction[:, None, :]
-    return jnp.zeros_like(like).at[found.vertices.reshape(-1)].add(force.reshape(-1, 3))
+def _spread(found, each, like):
+    """What every pair gives to its four vertices, added up by vertex."""
+    shape = each.shape[2:]
+    return jnp.zeros((len(like), *shape), like.dtype).at[found.vertices.reshape(-1)].add(each.reshape(-1, *shape))
 
 
 def gradient(found: Repulsion, x: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3"]:
     """dE/dx_i = sum_pairs 2 k_s min(d - eps, 0) w_i n in N; of x only the shape counts."""
-    return _spread(found, 2 * stiffness * found.shortfall, x)
+    along = (2 * stiffness * found.shortfall)[:, None] * found.weights
+    return _spread(found, along[..., None] * found.direction[:, None], x)
+
+
+def springs(found: Repulsion, stiffness: Float[Array, ""] | float) -> Float[Array, "pairs 4 3"]:
+    """v_i = sqrt(2 k_s [d < eps]) w_i n: the Gauss-Newton Hessian is sum_pairs v v^T, positive semi-definite."""
+    root = jnp.where(found.shortfall < 0, jnp.sqrt(2 * stiffness), 0)
+    return (root[:, None] * found.weights)[..., None] * found.direction[:, None]
 
 
 def product(found: Repulsion, p: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3"]:
-    """Gauss-Newton Hessian times p (m): sum_pairs 2 k_s [d < eps] w_i n (n . sum_j w_j p_j) in N; positive semi-definite."""
-    moved = jnp.sum(found.weights[..., None] * p[found.vertices], axis=1)
-    return _spread(found, _stiff(found, stiffness) * jnp.sum(found.direction * moved, axis=-1), p)
+    """Gauss-Newton Hessian times p (m): sum_pairs v (v . p) in N."""
+    v = springs(found, stiffness)
+    return _spread(found, v * jnp.sum(v * p[found.vertices], axis=(1, 2))[:, None, None], p)
 
 
 def blocks(found: Repulsion, x: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3 3"]:
-    """Blocks on the diagonal of the Gauss-Newton Hessian: sum_pairs 2 k_s [d < eps] w_i^2 n n^T in N/m; of x only the shape."""
-    square = found.direction[:, :, None] * found.direction[:, None, :]
-    each = (_stiff(found, stiffness)[:, None] * found.weights**2)[..., None, None] * square[:, None]
-    return jnp.zeros((*x.shape, 3), x.dtype).at[found.vertices.reshape(-1)].add(each.reshape(-1, 3, 3))
-
-
-def _stiff(found, stiffness):
-    return 2 * stiffness * (found.shortfall < 0).astype(found.shortfall.dtype)
-
-
-def unhindered(
-    x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs, radius: Float[Array, ""] | float
-) -> Float[Array, ""]:
-    """Largest share t, at most 1, of the move p (m) on whose way no pair can pass through each other.
-
-        t = min(1, 0.9 d / max_ij n . (p_j - p_i) of every pair in `pairs`, 0.9 radius / (2 max_i |p_i - c|))
-
-    with i in the pair's first primitive and j in its second: both are convex, so between them lies a slab of width d across n,
-    which cannot shrink faster than the fastest two of their vertices approach along n. All other pairs are `radius` apart (m,
-    of the search that found the pairs, without overflow), and no two vertices approach each other faster than
-    2 max |p_i - c|, whatever the constant c: the middle of the moves' bounding box.
-
-    Pairs that touch, d = 0, or touch in the rest shape, do not hinder. Source: Li et al. 2020, 5 (steps that keep apart), here
-    by separating planes.
-    """
-    vertices, _, apart = _apart(x, pairs)
-    distance, count = norm(apart), len(pairs.points)
-    moves = jnp.sum(p[vertices] * normalize(apart)[:, None], axis=-1)
-
-    def closing(moves, first):
-        return jnp.max(moves[:, first:], axis=1) - jnp.min(moves[:, :first], axis=1)
-
-    speed = jnp.concatenate([closing(moves[:count], 1), closing(moves[count:], 2)])
-    hinder = (speed > 0) & (distance > 0) & (pairs.rest > 0)
-    near = jnp.min(jnp.where(hinder, 0.9 * distance / jnp.where(hinder, speed, 1), 1), initial=1)
-    middle = (jnp.min(p, axis=0) + jnp.max(p, axis=0)) / 2
-    far = 2 * jnp.sqrt(jnp.max(jnp.sum((p - middle[None]) ** 2, axis=-1)))
-    return jnp.minimum(near, 0.9 * radius / jnp.maximum(far, 0.9 * radius))
+    """Blocks on the diagonal of the Gauss-Newton Hessian: sum_pairs v_i v_i^T in N/m; of x only the shape counts."""
+    v = springs(found, stiffness)
+    return _spread(found, v[..., :, None] * v[..., None, :], x)

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ncs_jax.energies import self_contact
 from ncs_jax.solver.directions import DIRECTIONS
-from ncs_jax.solver.patch import SIZE, Patch, patch_around, solve_dense
-from ncs_jax.solver.problem import Problem, blocks, come, descended, evaluated, imbalance, knowing, look, trusted
+from ncs_jax.solver.patch import SIZE, Patch, pairs_of, patch_around, solve_dense
+from ncs_jax.solver.problem import Problem, blocks, come, descended, evaluated, imbalance, knowing, look, looked, trusted
 
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Solution", "minimise"]
 
@@ -50,35 +51,49 @@ class Solution:
 
 def _on_patch(problem: Problem, patch: Patch) -> Problem:
     """The same frame seen by a patch alone."""
-    only = None if problem.near is None else patch.verts
-    return replace(problem, model=patch.model, couplings=patch.couplings, only=only)
+    only = None if problem.near is None and problem.pairs is None else patch.verts
+    pairs = None if problem.pairs is None else pairs_of(patch, problem.pairs)
+    return replace(problem, model=patch.model, couplings=patch.couplings, only=only, pairs=pairs)
 
 
-def relaxed(problem: Problem, x: Float[Array, "verts 3"], left: Float[Array, "verts"], tolerance):
+def relaxed(problem: Problem, x: Float[Array, "verts 3"], seen, left: Float[Array, "verts"], tolerance):
     """Positions after the patch of the greatest imbalance has found its own equilibrium, if it holds most of what is left.
 
-    left: squared imbalances over mass, of which the patch shall keep no more than a quarter of `tolerance`. Returns also how
-    many steps the patch took.
+    seen: from `look`, if anything. left: squared imbalances over mass, of which the patch shall keep no more than a quarter of
+    `tolerance`. Returns also what was seen last, and how many steps the patch took.
     """
     patch = patch_around(left, problem.model, problem.couplings)
-    local = _on_patch(problem, patch)
     moves = patch.place < SIZE
 
+    def local(seen):
+        return _on_patch(knowing(problem, seen), patch)
+
     def unfinished(state):
-        _, point, count, moved = state
+        _, point, _, count, moved = state
         kept = jnp.sum(jnp.where(moves, imbalance(problem, point.gradient), 0))
         return moved & (count < LOCAL) & (kept > 0.25 * tolerance)
 
     def iterate(state):
-        x, point, count, _ = state
-        p = -solve_dense(patch, *blocks(local, x, point), point.gradient)
-        x, point, moved = descended(local, x, point, p)
-        return x, point, count + 1, moved
+        x, point, seen, count, _ = state
+        springs = None
+        if point.folds is not None:
+            v = self_contact.springs(point.folds, problem.model.material.self_contact)
+            springs = point.folds.vertices, v if problem.free is None else v * problem.free[point.folds.vertices][..., None]
+        p = -solve_dense(patch, *blocks(local(seen), x, point._replace(folds=None)), point.gradient, springs)
+        x, point, _, moved = descended(local(seen), None, x, point, p)
+        if problem.pairs is not None:
+
+            def again():
+                seen = look(problem, x)
+                return evaluated(local(seen), x), seen
+
+            point, seen = lax.cond(come(x, seen[-1]) > trusted(problem, x), again, lambda: (point, seen))
+        return x, point, seen, count + 1, moved
 
     worth = patch.whole & (jnp.sum(jnp.where(moves, left, 0)) > SHARE * jnp.sum(left))
-    state = (x, evaluated(local, x), jnp.zeros((), jnp.int32), worth)
-    x, _, count, _ = lax.while_loop(unfinished, iterate, state)
-    return x, count
+    state = (x, evaluated(local(seen), x), seen, jnp.zeros((), jnp.int32), worth)
+    x, _, seen, count, _ = lax.while_loop(unfinished, iterate, state)
+    return x, seen, count
 
 
 def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
@@ -96,33 +111,33 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
 
     def iterate(state):
         x, point, memory, seen, _, _, iteration = state
-        here = knowing(problem, seen)
-        p, memory = direction.along(here, x, point, memory)
-        x, point, moved = descended(here, x, point, p)
+        p, memory = direction.along(knowing(problem, seen), x, point, memory)
+        x, point, seen, moved = descended(problem, seen, x, point, p)
         status, left = judged(point, ~moved, p)
-        if direction.patches and problem.pairs is None and x.shape[0] > 4 * SIZE:
+        if direction.patches and x.shape[0] > 4 * SIZE:
 
-            def relax(x, point):
-                x, count = relaxed(here, x, imbalance(here, point.gradient), mass * (tolerance * STANDARD_GRAVITY) ** 2)
-                point = lax.cond(count > 0, lambda: evaluated(here, x), lambda: point)
-                return x, point, *judged(point, False, x)
+            def relax(x, point, seen):
+                enough = mass * (tolerance * STANDARD_GRAVITY) ** 2
+                x, seen, count = relaxed(problem, x, seen, imbalance(problem, point.gradient), enough)
+                seen = looked(problem, x, seen)
+                point = lax.cond(count > 0, lambda: evaluated(knowing(problem, seen), x), lambda: point)
+                return x, point, seen, *judged(point, False, x)
 
-            x, point, status, left = lax.cond(status < 0, relax, lambda x, point: (x, point, status, left), x, point)
-        point, seen, status, left = looked_again(x, point, seen, status, left)
+            x, point, seen, status, left = lax.cond(status < 0, relax, lambda *same: (*same, status, left), x, point, seen)
+        point, seen, status, left = confirmed(x, point, seen, status, left)
         return x, point, memory, seen, status, left, iteration + 1
 
-    def looked_again(x, point, seen, status, left):
-        """With what is near found anew where a vertex has come far since it was, and before the frame is done in any case."""
+    def confirmed(x, point, seen, status, left):
+        """Before a frame is done, what is near is found anew, so that what is left is left by the energy itself."""
         if seen is None:
             return point, seen, status, left
 
         def again():
             seen = look(problem, x)
             point = evaluated(knowing(problem, seen), x)
-            return point, seen, *judged(point, status == STALLED, x)
+            return point, seen, *judged(point, False, x)
 
-        far = jnp.where(status == CONVERGED, 0, trusted(problem, x))
-        return lax.cond(come(x, seen[-1]) > far, again, lambda: (point, seen, status, left))
+        return lax.cond((status == CONVERGED) & (come(x, seen[-1]) > 0), again, lambda: (point, seen, status, left))
 
     def judged(point, stuck, p):
         left = jnp.sqrt(jnp.sum(imbalance(problem, point.gradient)) / mass) / STANDARD_GRAVITY
@@ -130,9 +145,9 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    point = evaluated(problem, start)
-    seen = None if problem.seen is None else (problem.near, problem.pairs, problem.seen)
-    point, seen, status, left = looked_again(start, point, seen, *judged(point, False, start))
+    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen))
+    point = evaluated(knowing(problem, seen), start)
+    point, seen, status, left = confirmed(start, point, seen, *judged(point, False, start))
     memory = direction.begin(knowing(problem, seen), start, point)
     state = (start, point, memory, seen, status, left, jnp.zeros((), jnp.int32))
     x, *_, status, left, iterations = lax.while_loop(unfinished, iterate, state)

@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.proximity import Pairs
 from ncs_jax.model import Model
 from ncs_jax.solver.stiffness import Couplings
 
-__all__ = ["SIZE", "Patch", "patch_around", "solve_dense"]
+__all__ = ["SIZE", "Patch", "pairs_of", "patch_around", "solve_dense"]
 
 SIZE = 128  # vertices
 SEEDS = 16  # vertices that a patch is gathered around
@@ -86,10 +87,33 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
     )
 
 
+def pairs_of(patch: Patch, pairs: Pairs) -> Pairs:
+    """Those that the patch moves; with `overflow` where they are too many."""
+    moves = patch.place < SIZE
+
+    def some(vertices, most):
+        real = vertices[:, 0] != vertices[:, 1]  # the others fill the list
+        rows, fits = _rows(jnp.any(moves[vertices], axis=1) & real, most)
+        return rows, _take(vertices, rows), fits
+
+    points, point_vertices, fits_points = some(pairs.points, 4 * SIZE)
+    edges, edge_vertices, fits_edges = some(pairs.edges, 12 * SIZE)
+    count = len(pairs.points)
+    rest = jnp.concatenate([_take(pairs.rest[:count], points), _take(pairs.rest[count:], edges)])
+    return Pairs(point_vertices, edge_vertices, rest, pairs.overflow | ~(fits_points & fits_edges))
+
+
 def solve_dense(
-    patch: Patch, diagonal: Float[Array, "verts 3 3"], off: Float[Array, "pairs 3 3"], right: Float[Array, "verts 3"]
+    patch: Patch,
+    diagonal: Float[Array, "verts 3 3"],
+    off: Float[Array, "pairs 3 3"],
+    right: Float[Array, "verts 3"],
+    springs: tuple[Int[Array, "springs 4"], Float[Array, "springs 4 3"]] | None = None,
 ) -> Float[Array, "verts 3"]:
-    """x with A x = right where the patch moves, and zero elsewhere."""
+    """x with A x = right where the patch moves, and zero elsewhere.
+
+    springs: vertices and vectors v of what A has beside the blocks, sum v v^T.
+    """
     k = jnp.arange(SIZE)
     i, j = patch.place[_take(patch.couplings.pairs, patch.inside)].T
     i = jnp.where(patch.inside < patch.couplings.pairs.shape[0], i, SIZE)
@@ -98,6 +122,12 @@ def solve_dense(
     matrix = matrix.at[i, :, j, :].add(block, mode="drop")
     matrix = matrix.at[j, :, i, :].add(jnp.swapaxes(block, 1, 2), mode="drop")
     matrix = matrix.at[k, :, k, :].add(diagonal[patch.verts]).reshape(3 * SIZE, 3 * SIZE)
+    if springs is not None:
+        vertices, vectors = springs
+        rows = jnp.zeros((len(vertices), SIZE, 3), right.dtype)
+        rows = rows.at[jnp.arange(len(vertices))[:, None], patch.place[vertices]].add(vectors, mode="drop")
+        rows = rows.reshape(-1, 3 * SIZE)
+        matrix = matrix + jnp.matmul(rows.T, rows, precision="highest")
     factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
     found = jax.scipy.linalg.cho_solve(factor, right[patch.verts].reshape(-1)).reshape(-1, 3)
     return jnp.zeros_like(right).at[patch.verts].set(found)

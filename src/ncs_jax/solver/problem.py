@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies import self_contact as folds
 from ncs_jax.energies.inertia import inertia
-from ncs_jax.energies.proximity import Pairs, free_share, nearby_pairs
+from ncs_jax.energies.proximity import Pairs, free_share, nearby_pairs, swept_share
 from ncs_jax.energies.self_contact import Repulsion, repulsion
 from ncs_jax.energies.smooth_contact import Quadrics, nearby_quadrics
 from ncs_jax.model import Model
@@ -23,7 +23,7 @@ from ncs_jax.solver.contact import Contact, touching
 from ncs_jax.solver.stiffness import Couplings, stiffness
 
 __all__ = ["Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored", "imbalance",
-           "knowing", "look", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
+           "knowing", "look", "looked", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
 LEAST_STEP = 1e-6  # of a step: below it the line search gives up
@@ -49,7 +49,7 @@ class Problem:
     seen: Float[Array, "verts 3"] | None = None  # as both were found from here
     carried: Float[Array, "verts 3"] | None = None  # see `Frame`, where there is friction
     pressed: Float[Array, "verts 3"] | None = None
-    only: Int[Array, "some"] | None = None  # the vertices whose contact changes, if not all
+    only: Int[Array, "some"] | None = None  # the vertices that move, if not all
 
     @property
     def frame(self) -> Frame:
@@ -129,6 +129,14 @@ def come(x: Float[Array, "verts 3"], seen: Float[Array, "verts 3"]) -> Float[Arr
     return jnp.sqrt(jnp.max(jnp.sum((x - seen) ** 2, axis=-1)))
 
 
+def looked(problem: Problem, x: Float[Array, "verts 3"], seen, far=None):
+    """What is near: found anew if a vertex has come farther than `far` since it was, or than can be trusted."""
+    if seen is None:
+        return None
+    far = trusted(problem, x) if far is None else far
+    return lax.cond(come(x, seen[-1]) > far, lambda: look(problem, x), lambda: seen)
+
+
 def knowing(problem: Problem, seen) -> Problem:
     """The problem that knows what `look` found."""
     return problem if seen is None else replace(problem, near=seen[0], pairs=seen[1], seen=seen[2])
@@ -187,16 +195,19 @@ def factored(problem: Problem, x: Float[Array, "verts 3"], point: Point):
 
 
 def apart(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3"]):
-    """The share of the way p on which no part of the cloth can pass through another."""
-    mesh, groups = problem.model.garment.mesh, problem.model.garment.groups
+    """The share of the way p on which no cloth can pass through other cloth, or a patch come near what is not known."""
     left = reach(problem) - 2 * come(x, problem.seen)  # what was not found is at least so far apart
-    share = folds.unhindered(x, p, problem.pairs, jnp.maximum(left, 0))
+    if problem.only is not None:
+        left = left - problem.model.material.self_thickness
+    share = free_share(x, p, problem.pairs, jnp.maximum(left, 0))
+    if problem.only is not None:
+        return share
 
-    def sought():
-        found, full = free_share(x, p, mesh, groups)
+    def swept():
+        found, full = swept_share(x, p, problem.model.garment.mesh, problem.model.garment.groups)
         return jnp.where(full, share, jnp.maximum(found, share))
 
-    return lax.cond(share < 1, sought, lambda: share)
+    return lax.cond(share < 1, swept, lambda: share)
 
 
 def unhindered(contact: Contact | None, p: Float[Array, "verts 3"]):
@@ -208,25 +219,30 @@ def unhindered(contact: Contact | None, p: Float[Array, "verts 3"]):
     return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
 
 
-def descended(problem: Problem, x: Float[Array, "verts 3"], point: Point, p: Float[Array, "verts 3"]):
-    """As far along p as the energy falls: the new positions, what is known of them, and whether they moved."""
+def descended(problem: Problem, seen, x: Float[Array, "verts 3"], point: Point, p: Float[Array, "verts 3"]):
+    """As far along p as the energy falls: the new positions, what is known of them, what is near, and whether they moved.
+
+    seen: from `look`, and found anew where a step goes far; None: as the problem knows it.
+    """
     slope = dot(point.gradient, p)
     noise = 16 * jnp.finfo(x.dtype).eps * jnp.abs(point.value)  # of a sum over a garment; with 4 eps float32 stalls
 
     def too_long(search):
-        t, new = search
+        t, new, _ = search
         lower = new.value <= point.value + 1e-4 * t * slope
         # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
         level = (jnp.abs(new.value - point.value) <= noise) & (dot(new.gradient, p) <= 0) & (-t * slope <= noise)
         return ~(lower | level) & (t > LEAST_STEP)
 
     def at(t):
-        return t, evaluated(problem, x + t * p)
+        there = x + t * p
+        near = looked(problem, there, seen)
+        return t, evaluated(knowing(problem, near), there), near
 
     longest = jnp.min(unhindered(point.contact, p))
     if problem.pairs is not None:
-        longest = jnp.minimum(longest, apart(problem, x, p))
-    t, new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(longest))
+        longest = jnp.minimum(longest, apart(knowing(problem, seen), x, p))
+    t, *new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(longest))
     moved = t > LEAST_STEP
-    point = jax.tree.map(functools.partial(jnp.where, moved), new, point)
-    return jnp.where(moved, x + t * p, x), point, moved
+    point, seen = jax.tree.map(functools.partial(jnp.where, moved), tuple(new), (point, seen))
+    return jnp.where(moved, x + t * p, x), point, seen, moved
