@@ -81,21 +81,23 @@ def _expected(problem: Problem, state: State, carried, blended) -> Float[Array, 
 
 def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Array, "verts 3"]):
     """As far from x to one target after the other as cloth comes without passing through itself; and the problem there."""
-    seen = look(problem, x)
-    for target in targets:
 
+    def approached(state, target):
         def unfinished(state):
             _, t, count, _ = state
             return (t >= WORTH) & (t < 1) & (count < APPROACH)
 
-        def go(state, target=target):
+        def go(state):
             x, _, count, seen = state
             t = apart(knowing(problem, seen), x, target - x)
             x = jnp.where(t < 1, jnp.where(t < WORTH, x, x + t * (target - x)), target)
             return x, t, count + 1, look(problem, x)
 
-        state = (x, jnp.full((), WORTH, x.dtype), jnp.zeros((), jnp.int32), seen)
-        x, _, _, seen = lax.while_loop(unfinished, go, state)
+        x, seen = state
+        x, _, _, seen = lax.while_loop(unfinished, go, (x, jnp.full((), WORTH, x.dtype), jnp.zeros((), jnp.int32), seen))
+        return (x, seen), None
+
+    (x, seen), _ = lax.scan(approached, (x, look(problem, x)), jnp.stack(targets))
     return knowing(problem, seen), x
 
 

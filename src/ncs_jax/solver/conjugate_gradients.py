@@ -8,11 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ncs_jax.solver.problem import dot
+
 __all__ = ["conjugate_gradients"]
-
-
-def _dot(a, b):
-    return jnp.sum(a * b)
 
 
 def conjugate_gradients(
@@ -25,19 +23,19 @@ def conjugate_gradients(
 
     def unfinished(state):
         _, r, _, rho, count, definite = state
-        return (jnp.sqrt(_dot(r, r)) > tolerance * jnp.sqrt(_dot(right, right))) & (count < most) & definite & (rho > 0)
+        return (jnp.sqrt(dot(r, r)) > tolerance * jnp.sqrt(dot(right, right))) & (count < most) & definite & (rho > 0)
 
     def iterate(state):
         x, r, p, rho, count, _ = state
         image = matrix(p)
-        curvature = _dot(p, image)
+        curvature = dot(p, image)
         definite = curvature > 0
         size = jnp.where(definite, rho / jnp.where(definite, curvature, 1), 0)
         x, r = x + size * p, r - size * image
         z = preconditioner(r)
-        new = _dot(r, z)
+        new = dot(r, z)
         return x, r, z + new / rho * p, new, count + 1, definite
 
     z = preconditioner(right)
-    state = (jnp.zeros_like(right), right, z, _dot(right, z), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    state = (jnp.zeros_like(right), right, z, dot(right, z), jnp.zeros((), jnp.int32), jnp.asarray(True))
     return lax.while_loop(unfinished, iterate, state)[0]

@@ -145,9 +145,9 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen))
+    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen), far=0)
     point = evaluated(knowing(problem, seen), start)
-    point, seen, status, left = confirmed(start, point, seen, *judged(point, False, start))
+    status, left = judged(point, False, start)
     memory = direction.begin(knowing(problem, seen), start, point)
     state = (start, point, memory, seen, status, left, jnp.zeros((), jnp.int32))
     x, *_, status, left, iterations = lax.while_loop(unfinished, iterate, state)

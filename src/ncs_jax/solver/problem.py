@@ -227,22 +227,24 @@ def descended(problem: Problem, seen, x: Float[Array, "verts 3"], point: Point, 
     slope = dot(point.gradient, p)
     noise = 16 * jnp.finfo(x.dtype).eps * jnp.abs(point.value)  # of a sum over a garment; with 4 eps float32 stalls
 
+    longest = jnp.min(unhindered(point.contact, p))
+    if problem.pairs is not None:
+        longest = jnp.minimum(longest, apart(knowing(problem, seen), x, p))
+
     def too_long(search):
         t, new, _ = search
         lower = new.value <= point.value + 1e-4 * t * slope
         # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
         level = (jnp.abs(new.value - point.value) <= noise) & (dot(new.gradient, p) <= 0) & (-t * slope <= noise)
-        return ~(lower | level) & (t > LEAST_STEP)
+        return (t > longest) | ~(lower | level) & (t > LEAST_STEP)
 
-    def at(t):
+    def shorter(search):
+        t = search[0] / 2
         there = x + t * p
         near = looked(problem, there, seen)
         return t, evaluated(knowing(problem, near), there), near
 
-    longest = jnp.min(unhindered(point.contact, p))
-    if problem.pairs is not None:
-        longest = jnp.minimum(longest, apart(knowing(problem, seen), x, p))
-    t, *new = lax.while_loop(too_long, lambda search: at(search[0] / 2), at(longest))
+    t, *new = lax.while_loop(too_long, shorter, (2 * longest, point, seen))
     moved = t > LEAST_STEP
     point, seen = jax.tree.map(functools.partial(jnp.where, moved), tuple(new), (point, seen))
     return jnp.where(moved, x + t * p, x), point, seen, moved
