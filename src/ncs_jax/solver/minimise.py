@@ -87,7 +87,7 @@ def relaxed(problem: Problem, x: Float[Array, "verts 3"], seen, left: Float[Arra
                 seen = look(problem, x)
                 return evaluated(local(seen), x), seen
 
-            point, seen = lax.cond(come(x, seen[-1]) > trusted(problem, x), again, lambda: (point, seen))
+            point, seen = lax.cond(come(x, seen[-1]) > trusted(problem, x) / 2, again, lambda: (point, seen))
         return x, point, seen, count + 1, moved
 
     worth = patch.whole & (jnp.sum(jnp.where(moves, left, 0)) > SHARE * jnp.sum(left))
@@ -119,16 +119,15 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
             def relax(x, point, seen):
                 enough = mass * (tolerance * STANDARD_GRAVITY) ** 2
                 x, seen, count = relaxed(problem, x, seen, imbalance(problem, point.gradient), enough)
-                seen = looked(problem, x, seen)
                 point = lax.cond(count > 0, lambda: evaluated(knowing(problem, seen), x), lambda: point)
                 return x, point, seen, *judged(point, False, x)
 
             x, point, seen, status, left = lax.cond(status < 0, relax, lambda *same: (*same, status, left), x, point, seen)
-        point, seen, status, left = confirmed(x, point, seen, status, left)
+        point, seen, status, left = looked_again(x, point, seen, status, left)
         return x, point, memory, seen, status, left, iteration + 1
 
-    def confirmed(x, point, seen, status, left):
-        """Before a frame is done, what is near is found anew, so that what is left is left by the energy itself."""
+    def looked_again(x, point, seen, status, left):
+        """With what is near found anew before that can no longer be trusted, and in any case before the frame is done."""
         if seen is None:
             return point, seen, status, left
 
@@ -137,7 +136,9 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
             point = evaluated(knowing(problem, seen), x)
             return point, seen, *judged(point, False, x)
 
-        return lax.cond((status == CONVERGED) & (come(x, seen[-1]) > 0), again, lambda: (point, seen, status, left))
+        done = (status == CONVERGED) | (status == STALLED)
+        far = jnp.where(done, 0, trusted(problem, x) / 2)
+        return lax.cond(come(x, seen[-1]) > far, again, lambda: (point, seen, status, left))
 
     def judged(point, stuck, p):
         left = jnp.sqrt(jnp.sum(imbalance(problem, point.gradient)) / mass) / STANDARD_GRAVITY
@@ -145,9 +146,11 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen), far=0)
+    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen))
     point = evaluated(knowing(problem, seen), start)
     status, left = judged(point, False, start)
+    if seen is not None:  # as `looked_again` would, but without a program of its own: one step is taken in any case
+        status = jnp.where((status == CONVERGED) & (come(start, seen[-1]) > 0), -1, status)
     memory = direction.begin(knowing(problem, seen), start, point)
     state = (start, point, memory, seen, status, left, jnp.zeros((), jnp.int32))
     x, *_, status, left, iterations = lax.while_loop(unfinished, iterate, state)

@@ -118,9 +118,9 @@ def trusted(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
     """How far a vertex may come from where `look` was, m, until what it left out could matter."""
     far = jnp.asarray(jnp.inf, x.dtype)
     if problem.model.terms.collision == "smooth":
-        far = problem.model.surface.spacing.astype(x.dtype)
+        far = 2 * problem.model.surface.spacing.astype(x.dtype)
     if problem.model.terms.self_contact:
-        far = jnp.minimum(far, 0.4 * (reach(problem) - problem.model.material.self_thickness))
+        far = jnp.minimum(far, (reach(problem) - problem.model.material.self_thickness) / 2)
     return far
 
 
@@ -129,12 +129,11 @@ def come(x: Float[Array, "verts 3"], seen: Float[Array, "verts 3"]) -> Float[Arr
     return jnp.sqrt(jnp.max(jnp.sum((x - seen) ** 2, axis=-1)))
 
 
-def looked(problem: Problem, x: Float[Array, "verts 3"], seen, far=None):
-    """What is near: found anew if a vertex has come farther than `far` since it was, or than can be trusted."""
+def looked(problem: Problem, x: Float[Array, "verts 3"], seen):
+    """What is near: found anew if a vertex has come farther since it was than can be trusted."""
     if seen is None:
         return None
-    far = trusted(problem, x) if far is None else far
-    return lax.cond(come(x, seen[-1]) > far, lambda: look(problem, x), lambda: seen)
+    return lax.cond(come(x, seen[-1]) > trusted(problem, x), lambda: look(problem, x), lambda: seen)
 
 
 def knowing(problem: Problem, seen) -> Problem:
