@@ -75,12 +75,12 @@ def relaxed(problem: Problem, x: Float[Array, "verts 3"], seen, left: Float[Arra
 
     def iterate(state):
         x, point, seen, count, _ = state
-        springs = None
+        here, springs = local(seen), None
         if point.folds is not None:
             v = self_contact.springs(point.folds, problem.model.material.self_contact)
             springs = point.folds.vertices, v if problem.free is None else v * problem.free[point.folds.vertices][..., None]
-        p = -solve_dense(patch, *blocks(local(seen), x, point._replace(folds=None)), point.gradient, springs)
-        x, point, _, moved = descended(local(seen), None, x, point, p)
+        p = -solve_dense(patch, *blocks(here, x, point._replace(folds=None)), point.gradient, springs)
+        x, point, _, moved = descended(here, None, x, point, p)
         if problem.pairs is not None:
 
             def again():
