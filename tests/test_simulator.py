@@ -184,6 +184,19 @@ def test_single_precision(tmp_path, moved, plain_jax):
     np.testing.assert_allclose(np.asarray(x), moved[0], rtol=0, atol=1e-3)
 
 
+def test_a_character_far_away_is_solved_as_one_at_home(tmp_path, plain_jax):
+    """In single precision, whose places are 4 um apart 50 m away: as much as that in a pin would be 4 g."""
+    assembly = sleeve(tmp_path, jnp.float32, pinning={"stiffness": 1000.0})
+    motion, simulator = next(iter(assembly.motions.values())), simulator_from(assembly.model)
+    ends, away = [], np.array([48.0, 0.0, -16.0])
+    for shift in (0 * away, away):
+        track = track_of(assembly.model, edited(motion, motion.poses, motion.translation + shift))
+        x, solution = run(simulator, track, Settings(tolerance=0.05))
+        assert np.all(np.asarray(solution.status) == CONVERGED)
+        ends.append(np.asarray(x, np.float64) - shift)
+    np.testing.assert_allclose(*ends, rtol=0, atol=2e-3)
+
+
 def test_motions_in_a_batch_equal_the_loop(scene, moved):
     """A batch waits for its slowest, and what is done is left alone."""
     assembly, simulator, motion = scene

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
+from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.proximity import Groups, groups_from, intersecting
 from ncs_jax.kinematics import blend, skin, unpose
@@ -42,6 +43,9 @@ def _frame(
     model: Model, exact: bool, groups: Groups | None, x, previous, before, matrices, matrices_before
 ) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
+    origin = matrices[:1, :, 3]  # seen from the root joint, where single precision is finest
+    x, previous, before = x - origin, previous - origin, before - origin
+    matrices, matrices_before = matrices.at[:, :, 3].add(-origin), matrices_before.at[:, :, 3].add(-origin)
     body = None if model.body is None else pose_body(model, matrices)
     blended = blend(matrices, model.blend) if terms.pinning else None
     carried = pressed = None
@@ -56,6 +60,9 @@ def _frame(
 
     (total, parts), gradient = jax.value_and_grad(value, has_aux=True)(x)
     mass = model.material.density * mesh.vertex_area
+    if terms.gravity:
+        lifted = gravity(origin, jnp.sum(mass, keepdims=True), model.material.gravity)
+        total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
     heavy = mass > 0
     square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
     strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
+from ncs_jax.model import local_rotations
 from ncs_jax.objective import Frame, total
-from ncs_jax.simulator import stepper
+from ncs_jax.simulator import simulator_from, stepper
 from ncs_jax.solver.minimise import CONVERGED
 
+from ..scenes import grid
 from ..shapes import rotation
-from ..test_simulator import SETTINGS, TOLERANCE, advance, loose, thrown
+from ..test_simulator import SETTINGS, TOLERANCE, advance, loose, thrown, written
+from .newton import order
 
 pytestmark = pytest.mark.slow
 
@@ -103,3 +109,75 @@ def test_a_sheet_on_one_pin_swings_as_a_rigid_pendulum(tmp_path):
     expected = recursion(w, dt, angle[1], 24)
     assert expected.min() < -0.5 * 0.02  # it has swung to the other side
     np.testing.assert_allclose(angle, expected, rtol=0, atol=0.03 * 0.02)
+
+
+SOFT = 1.0  # N/m: mu of cloth that stretches by an eighth under its own weight
+
+
+def elastic(folder, vertices, faces, pins=(), dtype=jnp.float64):
+    """Soft cloth by itself whose lambda is zero, so that it does not narrow; and its pose."""
+    assembly = written(folder, vertices, faces, pins, dtype, collision={"stiffness": 0}, membrane={"model": "stvk"})
+    model, motion = assembly.model, next(iter(assembly.motions.values()))
+    material = replace(model.material, membrane=(jnp.zeros((), dtype), jnp.asarray(SOFT, dtype)))
+    pose = local_rotations(model, jnp.asarray(motion.poses, dtype))[0]
+    return simulator_from(replace(model, material=material)), pose
+
+
+def hung(folder, rows, dtype, tolerance):
+    """How far the vertices of a strip of 0.2 m on its pins hang below where the closed form has them, and how far that sags.
+
+    P(s) = q (L - s) = mu F (F^2 - 1): the weight below, and the first Piola-Kirchhoff stress of St. Venant and Kirchhoff for a
+    stretch F along and none across; y(s) = integral of F. The mass of a cell is shared by its four corners, not by its two
+    triangles, whose vertices have more of it at the ends of the diagonals: so every row stays straight.
+    """
+    length, columns = 0.2, 3
+    vertices, faces = grid(rows + 1, columns, length / rows)
+    simulator, pose = elastic(folder, vertices, faces, np.arange(rows * columns, (rows + 1) * columns), dtype)
+    half = [np.r_[0.5, np.ones(n - 2), 0.5] * length / rows for n in (rows + 1, columns)]
+    mesh = simulator.model.garment.mesh
+    mesh = replace(mesh, vertex_area=jnp.asarray(np.outer(*half).reshape(-1), dtype))
+    simulator = replace(simulator, model=replace(simulator.model, garment=replace(simulator.model.garment, mesh=mesh)))
+    settings = replace(SETTINGS, tolerance=tolerance, exact_pins=True)
+    state, x = advance(simulator, settings, stepper(simulator, settings).init(), pose, jnp.zeros(3, dtype))
+    assert state.solution.status == CONVERGED and x.dtype == dtype
+    weight = 9.81 * float(simulator.model.material.density)
+    stretch = lambda s: brentq(lambda f: SOFT * f * (f * f - 1) - weight * (length - s), 1, 2, xtol=1e-15)  # noqa: E731
+    below = vertices[:, 1].max() - vertices[:, 1]
+    hangs = {s: quad(stretch, 0, s, epsabs=1e-13)[0] for s in np.unique(below)}
+    x, sag = np.asarray(x, np.float64), hangs[below.max()] - length
+    assert np.abs(x - vertices)[:, [0, 2]].max() < 1e-3 * sag
+    return x[:, 1] - (vertices[:, 1].max() - np.array([hangs[s] for s in below])), sag
+
+
+def test_a_strip_hangs_as_its_closed_form_to_second_order_in_its_cells(tmp_path):
+    errors = []
+    for rows in (5, 10, 20):
+        folder = tmp_path / str(rows)
+        folder.mkdir()
+        error, sag = hung(folder, rows, jnp.float64, 1e-8)
+        errors.append(np.abs(error).max())
+    assert sag > 0.01 and errors[-1] < 1e-3 * sag and abs(order(errors) - 2) < 0.2
+
+
+def test_an_elastic_throw_converges_with_the_step(tmp_path):
+    """A sheet that spins, stretches and falls: its places after 0.05 s by four steps, each half as long as the one before."""
+    simulator, pose = elastic(tmp_path, *grid())
+    rest = np.asarray(simulator.model.garment.mesh.rest)
+    arm = rest - rest.mean(axis=0)
+    start = rest + 0.05 * arm * np.cos(np.pi * arm[:, 1:2] / 0.25)
+    velocity = np.cross([4.0, -3.0, 6.0], arm) + 2.0 * arm
+    ends = []
+    for steps in (10, 20, 40, 80):
+        timed = replace(simulator, model=replace(simulator.model, fps=steps / 0.05))
+        ends.append(follow(timed, pose, thrown(timed, start, jnp.asarray(velocity)), steps)[-1])
+    differences = [np.abs(b - a).max() for a, b in pairwise(ends)]
+    moved = np.abs(ends[-1] - start).max()
+    assert moved > 0.02 and differences[-1] < 0.02 * moved and abs(order(differences) - 1) < 0.2
+
+
+# --- in single precision ------------------------------------------------------------------------------------------------
+
+
+def test_a_strip_hangs_as_its_closed_form_in_single_precision(tmp_path):
+    error, sag = hung(tmp_path, 10, jnp.float32, 0.003)
+    assert np.abs(error).max() < 0.01 * sag

@@ -41,6 +41,7 @@ class Blended(NamedTuple):
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
 ELSEWHERE = 0.15  # what a quadric counts, beside f, where another's sheet of the body is looked at; more than -min f = 1/8
+EDGE = 2.0  # in h: how far along it a tangent surface is still the body
 SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
 
 
@@ -104,7 +105,12 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     ratio = square / (4 * width)
     shown = 1 / (1 + ratio * ratio)
     bend = product(powers, near.bends.T) * shown
-    distance = product(cloth, near.normals.T) - near.offsets + bend
+    height = product(cloth, near.normals.T) - near.offsets
+    off = jnp.sqrt(jnp.maximum(square - height * height, EDGE**2 * width))
+    past = off - EDGE * jnp.sqrt(width)
+    flat = height * height + width
+    inner, outer = jnp.sqrt(flat), jnp.sqrt(flat + 4 * past * past)
+    distance = height + bend + (outer - inner) / 2
     squares = _products(near.normals)
     ones = jnp.ones_like(squares[..., :1])
     alike = jnp.concatenate([ones, near.normals, squares], axis=-1)
@@ -121,10 +127,12 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     push = 2 * share * short
     lost = share * short * short
     own = lost - weight * product(product(lost / around, alike), facing)
-    along = -4 / width * own - push * bend * ratio * shown / (2 * width)
+    around_edge = push * past / (off * outer)
+    upward = push * (1 + height * (1 / outer - 1 / inner) / 2) - 2 * around_edge * height
+    along = -4 / width * own - push * bend * ratio * shown / (2 * width) + around_edge
     pull = product(along, jnp.concatenate([ones, near.points], axis=-1))
     turn = product(push * shown, near.bends)
-    slope = product(push, near.normals) + 2 * (pull[..., :1] * cloth - pull[..., 1:]) + turn[..., 6:9]
+    slope = product(upward, near.normals) + 2 * (pull[..., :1] * cloth - pull[..., 1:]) + turn[..., 6:9]
     bent = [[turn[..., PAIRS.index((min(i, j), max(i, j)))] * (2 if i == j else 1) for j in range(3)] for i in range(3)]
     slope = slope + jnp.stack([sum(bent[i][j] * cloth[..., j] for j in range(3)) for i in range(3)], axis=-1)
     return Blended(
@@ -145,13 +153,17 @@ def blended(
     """Contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
 
         shortfall = sum_i v_i min(d_i - thickness, 0)^2
-        d_i = n_i . r_i + g_i r_i . S_i r_i / 2,   r_i = x - b_i,   S_i the shape operator at b_i,   g_i = 1/(1 + (|r_i|/2h)^4)
+        d_i = z_i + g_i r_i . S_i r_i / 2 + (sqrt(z_i^2 + h^2 + 4 e_i^2) - sqrt(z_i^2 + h^2)) / 2,   z_i = n_i . r_i
+        e_i = max(sqrt(|r_i|^2 - z_i^2) - 2 h, 0)
+        r_i = x - b_i,   S_i the shape operator at b_i,   g_i = 1/(1 + (|r_i|/2h)^4)
         v_i = (1 + c) w_i / sum_j w_j (f_ij + c),   w_i = exp(-4 |r_i|^2 / h^2),   f_ij = n_i . n_j (1 + n_i . n_j) / 2
 
-    with c = 0.15 and h the mean edge length of the resting body; g keeps a bend from being taken for more than it shows. On one
-    sheet of the body v is a mean. Two sheets that face each other, as an arm and the torso, push each by itself: one mean of
-    both would let what the one has to spare make good what the other misses. To the plane of the nearest vertex this is what a
-    smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that rests there has no equilibrium.
+    with c = 0.15 and h the mean edge length of the resting body. g keeps a bend from being taken for more than it shows; e is
+    how far x is off a tangent surface that ends at 2 h, beyond which there is no body: between two legs their surfaces would
+    meet. On one sheet of the body v is a mean. Two sheets that face each other, as an arm and the torso, push each by itself:
+    one mean of both would let what the one has to spare make good what the other misses. To the plane of the nearest vertex
+    this is what a smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that rests there has no
+    equilibrium.
     `only`: of these vertices; otherwise of all.
 
     The distance is the mean of d_i by w_i. Source: Kolluri 2005 (implicit moving least squares), there for planes and one mean.
