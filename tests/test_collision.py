@@ -319,15 +319,15 @@ def by_the_formula(x, vertices, faces):
         gap = point - vertices
         square = np.sum(gap**2, axis=1)
         z = np.sum(gap * normals, axis=1)
-        past = np.maximum(np.sqrt(np.maximum(square - z**2, 0)) - 2 * h, 0)
-        d = z + np.einsum("vi,vij,vj->v", gap, bend, gap) / 2 / (1 + (square / (4 * h**2)) ** 2)
-        d = d + (np.sqrt(z**2 + h**2 + 4 * past**2) - np.sqrt(z**2 + h**2)) / 2
+        q = square / (4 * h**2)
+        d = z + np.einsum("vi,vij,vj->v", gap, bend, gap) / 2 / (1 + q**2)
+        d = d + h * np.maximum(q - (z / (2 * h)) ** 2 - 1, 0) ** 2 / (1 + q)
         w = np.exp(4 * (square.min() - square) / h**2)
         heavy = w > 1e-12
         cosine = normals[heavy] @ normals[heavy].T
         w, d = w[heavy], d[heavy]
         share = 1.15 * w / ((cosine * (1 + cosine) / 2) @ w + 0.15 * w.sum())
-        result.append([np.sum(share * np.minimum(d - THICKNESS, 0) ** 2), np.sum(w * d) / w.sum()])
+        result.append([np.sum(share * np.minimum(d - THICKNESS, 0) ** 2), min(np.sum(w * d) / w.sum(), np.sqrt(square.min()))])
     return np.array(result).T
 
 

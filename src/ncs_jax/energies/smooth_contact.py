@@ -41,7 +41,6 @@ class Blended(NamedTuple):
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
 ELSEWHERE = 0.15  # what a quadric counts, beside f, where another's sheet of the body is looked at; more than -min f = 1/8
-EDGE = 2.0  # in h: how far along it a tangent surface is still the body
 SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
 
 
@@ -99,18 +98,17 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     far = jnp.concatenate([jnp.ones_like(near.points[..., :1]), -2 * near.points, near.squares.T], axis=-1)
     square = product(jnp.concatenate([length, cloth, one], axis=-1), far.T)  # |r|^2
     nearest = lax.stop_gradient(jnp.min(square, axis=-1, keepdims=True))
-    width = surface.spacing.astype(cloth.dtype) ** 2
+    h = surface.spacing.astype(cloth.dtype)
+    width = h * h
     weight = jnp.exp(jnp.maximum((nearest - square) * (4 / width), -40))  # no weight so small that its products leave the range
     powers = jnp.concatenate([_products(cloth), cloth, one], axis=-1)
     ratio = square / (4 * width)
     shown = 1 / (1 + ratio * ratio)
     bend = product(powers, near.bends.T) * shown
     height = product(cloth, near.normals.T) - near.offsets
-    off = jnp.sqrt(jnp.maximum(square - height * height, EDGE**2 * width))
-    past = off - EDGE * jnp.sqrt(width)
-    flat = height * height + width
-    inner, outer = jnp.sqrt(flat), jnp.sqrt(flat + 4 * past * past)
-    distance = height + bend + (outer - inner) / 2
+    past = jnp.maximum(ratio - height * height / (4 * width) - 1, 0)
+    ended = past / (1 + ratio)
+    distance = height + bend + h * past * ended
     squares = _products(near.normals)
     ones = jnp.ones_like(squares[..., :1])
     alike = jnp.concatenate([ones, near.normals, squares], axis=-1)
@@ -127,9 +125,8 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     push = 2 * share * short
     lost = share * short * short
     own = lost - weight * product(product(lost / around, alike), facing)
-    around_edge = push * past / (off * outer)
-    upward = push * (1 + height * (1 / outer - 1 / inner) / 2) - 2 * around_edge * height
-    along = -4 / width * own - push * bend * ratio * shown / (2 * width) + around_edge
+    upward = push * (1 - height * ended / h)
+    along = -4 / width * own + push * (ended * (2 - ended) / (4 * h) - bend * ratio * shown / (2 * width))
     pull = product(along, jnp.concatenate([ones, near.points], axis=-1))
     turn = product(push * shown, near.bends)
     slope = product(upward, near.normals) + 2 * (pull[..., :1] * cloth - pull[..., 1:]) + turn[..., 6:9]
@@ -139,7 +136,7 @@ def _blended(cloth, near, surface, thickness) -> Blended:
         jnp.sum(lost, axis=-1),
         slope,
         full.reshape(*full.shape[:-1], 3, 3),
-        jnp.sum(weight * distance, axis=-1) / sums[..., 0],
+        jnp.minimum(jnp.sum(weight * distance, axis=-1) / sums[..., 0], jnp.sqrt(jnp.maximum(nearest[..., 0], 0))),
     )
 
 
@@ -153,20 +150,20 @@ def blended(
     """Contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
 
         shortfall = sum_i v_i min(d_i - thickness, 0)^2
-        d_i = z_i + g_i r_i . S_i r_i / 2 + (sqrt(z_i^2 + h^2 + 4 e_i^2) - sqrt(z_i^2 + h^2)) / 2,   z_i = n_i . r_i
-        e_i = max(sqrt(|r_i|^2 - z_i^2) - 2 h, 0)
-        r_i = x - b_i,   S_i the shape operator at b_i,   g_i = 1/(1 + (|r_i|/2h)^4)
+        d_i = z_i + g_i r_i . S_i r_i / 2 + h e_i^2 / (1 + q_i),   e_i = max(q_i - (z_i/2h)^2 - 1, 0)
+        r_i = x - b_i,   z_i = n_i . r_i,   q_i = |r_i|^2 / 4h^2,   S_i the shape operator at b_i,   g_i = 1/(1 + q_i^2)
         v_i = (1 + c) w_i / sum_j w_j (f_ij + c),   w_i = exp(-4 |r_i|^2 / h^2),   f_ij = n_i . n_j (1 + n_i . n_j) / 2
 
     with c = 0.15 and h the mean edge length of the resting body. g keeps a bend from being taken for more than it shows; e is
-    how far x is off a tangent surface that ends at 2 h, beyond which there is no body: between two legs their surfaces would
-    meet. On one sheet of the body v is a mean. Two sheets that face each other, as an arm and the torso, push each by itself:
-    one mean of both would let what the one has to spare make good what the other misses. To the plane of the nearest vertex
-    this is what a smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that rests there has no
-    equilibrium.
+    how far x lies beyond the end of a tangent surface, 2 h from its vertex, where there is no body: between two legs their
+    surfaces would meet. On one sheet of the body v is a mean. Two sheets that face each other, as an arm and the torso, push
+    each by itself: one mean of both would let what the one has to spare make good what the other misses. To the plane of the
+    nearest vertex this is what a smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that
+    rests there has no equilibrium.
     `only`: of these vertices; otherwise of all.
 
-    The distance is the mean of d_i by w_i. Source: Kolluri 2005 (implicit moving least squares), there for planes and one mean.
+    The distance is the mean of d_i by w_i, and no greater than that of the nearest vertex. Source: Kolluri 2005 (implicit
+    moving least squares), there for planes and one mean.
     """
     near, cloth = quadrics, x[surface.cloth_blocks]
     if only is not None:
