@@ -124,6 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--growth", action="store_true", help="one iteration on ever finer garments")
     parser.add_argument("--json", metavar="FILE", help="write the figures there too")
     options = parser.parse_args(arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `ncs simulate` does
     try:
         result = benchmark(options.scene, max(options.frames, 2), options.iterations, options.growth)
     except InputError as error:

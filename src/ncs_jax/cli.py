@@ -28,6 +28,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit code is 0, or 2 for input that cannot be used, or 130 when interrupted."""
     parsed = _parser().parse_args(arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
     _keep_compiled_programs()
     try:
         return parsed.run(parsed)
