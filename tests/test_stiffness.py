@@ -253,6 +253,18 @@ def test_pinning_is_the_hessian():
     assert np.abs(still - np.asarray(x)).max() > 0.01 and np.abs(right).max() > 1000
 
 
+def test_places_of_a_garment_of_many_vertices():
+    """Their numbers' products do not fit 32 bits."""
+    mesh = mesh_from(*sheet(220, 220, 0.01))
+    couplings = couplings_from(mesh)
+    pairs, ends = np.asarray(couplings.pairs), ((0, 1), (1, 2), (2, 0))
+    for found, right in [
+        (couplings.edge_pairs, mesh.edges),
+        *((couplings.face_pairs[i], mesh.faces[:, np.asarray(p)]) for i, p in enumerate(ends)),
+    ]:
+        np.testing.assert_array_equal(pairs[np.asarray(found)], np.sort(right, axis=1))
+
+
 # --- which terms there are ----------------------------------------------------------------------------------------------
 
 ALL = Terms(collision="plane", pinning=True)

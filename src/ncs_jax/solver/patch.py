@@ -82,6 +82,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
             _take(couplings.face_flips, faces, False, axis=1),
             _take(couplings.hinge_pairs, hinges, axis=1),
             _take(couplings.hinge_flips, hinges, False, axis=1),
+            _take(couplings.edge_pairs, edges),
         ),
         whole=whole,
     )

@@ -38,6 +38,7 @@ class Couplings:
     face_flips: Bool[Array, "3 faces"]
     hinge_pairs: Int[Array, "6 hinges"]
     hinge_flips: Bool[Array, "6 hinges"]
+    edge_pairs: Int[Array, "edges"]  # its block is symmetric: it has no flips
 
 
 def couplings_from(mesh: Mesh) -> Couplings:
@@ -53,7 +54,8 @@ def couplings_from(mesh: Mesh) -> Couplings:
         index = np.searchsorted(pairs @ size, np.sort(p, axis=-1) @ size)
         return jnp.asarray(index, jnp.int32), jnp.asarray(p[..., 0] > p[..., 1])
 
-    return Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges))
+    edges, _ = place(np.asarray(mesh.edges))
+    return Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges), edge_pairs=edges)
 
 
 def _membrane(x, mesh: Mesh, density, numbers):
@@ -163,13 +165,8 @@ def stiffness(
 
     if terms.membrane == "mass_spring":
         block = _springs(x, mesh, *material.membrane)
-        # an edge is a pair of its own: its place is found as that of a face's side
-        place = jnp.searchsorted(
-            couplings.pairs[:, 0] * x.shape[0] + couplings.pairs[:, 1],
-            jnp.min(mesh.edges, axis=1) * x.shape[0] + jnp.max(mesh.edges, axis=1),
-        )
         diagonal = diagonal.at[mesh.edges].add(block[:, None])
-        off = off.at[place].add(-block)
+        off = off.at[couplings.edge_pairs].add(-block)
     elif terms.membrane is not None:
         blocks = _membrane(x, mesh, DENSITIES[terms.membrane], material.membrane)
         diagonal = diagonal.at[mesh.faces.T].add(jnp.stack([blocks[k, k] for k in range(3)]))
