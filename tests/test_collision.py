@@ -321,7 +321,7 @@ def by_the_formula(x, vertices, faces):
         z = np.sum(gap * normals, axis=1)
         q = square / (4 * h**2)
         d = z + np.einsum("vi,vij,vj->v", gap, bend, gap) / 2 / (1 + q**2)
-        d = d + h * np.maximum(q - (z / (2 * h)) ** 2 - 1, 0) ** 2 / (1 + q)
+        d = d + 2 * h * np.maximum(q - (z / (2 * h)) ** 2 - 1, 0) ** 2 / (1 + q)
         w = np.exp(4 * (square.min() - square) / h**2)
         heavy = w > 1e-12
         cosine = normals[heavy] @ normals[heavy].T

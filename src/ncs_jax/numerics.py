@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 
 __all__ = ["angle_between", "norm", "normalize", "positive_part", "signed_angle"]
 
+SWEEPS = 30  # of Jacobi rotations, at most
+
 
 def _least(dtype):
     """Length in the unit of the argument; under it a second derivative 1/length^2 nears the end of the range of the type."""
@@ -48,19 +50,25 @@ def angle_between(a: Float[Array, "*rows 3"], b: Float[Array, "*rows 3"]) -> Flo
     return signed_angle(norm(jnp.cross(a, b)), jnp.sum(a * b, axis=-1))
 
 
-def positive_part(a: Float[Array, "n n *lanes"], sweeps: int = 6) -> Float[Array, "n n *lanes"]:
+def positive_part(a: Float[Array, "n n *lanes"]) -> Float[Array, "n n *lanes"]:
     """Nearest positive semi-definite matrices to small symmetric ones: V max(Lambda, 0) V^T, by cyclic Jacobi rotations.
 
-    The matrices lie across the lanes, so that thousands are turned at once; six sweeps reach rounding for n up to 6
-    (`tests/test_numerics.py`). Source: Golub and Van Loan, 8.5.
+    The matrices lie across the lanes, so that thousands are turned at once, until all are diagonal to rounding. Source: Golub
+    and Van Loan, 8.5.
     """
     n = a.shape[0]
     pairs = [(p, q) for p in range(n) for q in range(p + 1, n)]
     eye = jnp.broadcast_to(jnp.eye(n, dtype=a.dtype).reshape(n, n, *(1,) * (a.ndim - 2)), a.shape)
     size = jnp.max(jnp.abs(a), axis=(0, 1))
     scale = jnp.where(size > 0, size, 1)
+    rounding = jnp.finfo(a.dtype).eps
 
-    def sweep(_, state):
+    def unfinished(state):
+        matrices, _, count = state
+        beside = jnp.stack([jnp.abs(matrices[p, q]) for p, q in pairs])
+        return jnp.any(~(beside <= rounding)) & (count < SWEEPS)
+
+    def sweep(state):
         m = {(i, j): state[0][i, j] for i in range(n) for j in range(i, n)}
         v = {(i, j): state[1][i, j] for i in range(n) for j in range(n)}
 
@@ -69,7 +77,7 @@ def positive_part(a: Float[Array, "n n *lanes"], sweeps: int = 6) -> Float[Array
 
         for p, q in pairs:
             off = m[p, q]
-            none = off == 0
+            none = jnp.abs(off) <= rounding  # what is done stays as it is, whatever its neighbours still need
             ratio = (m[q, q] - m[p, p]) / (2 * jnp.where(none, 1, off))
             t = jnp.where(none, 0, jnp.where(ratio >= 0, 1, -1) / (jnp.abs(ratio) + jnp.sqrt(ratio * ratio + 1)))
             c = 1 / jnp.sqrt(t * t + 1)
@@ -84,9 +92,10 @@ def positive_part(a: Float[Array, "n n *lanes"], sweeps: int = 6) -> Float[Array
         return (
             jnp.stack([jnp.stack([m[at(i, j)] for j in range(n)]) for i in range(n)]),
             jnp.stack([jnp.stack([v[i, j] for j in range(n)]) for i in range(n)]),
+            state[2] + 1,
         )
 
-    values, vectors = lax.fori_loop(0, sweeps, sweep, (a / scale[None, None], eye))
+    values, vectors, _ = lax.while_loop(unfinished, sweep, (a / scale[None, None], eye, jnp.zeros((), jnp.int32)))
     kept = [jnp.maximum(values[k, k], 0) * scale for k in range(n)]
     return jnp.stack(
         [jnp.stack([sum(vectors[i, k] * kept[k] * vectors[j, k] for k in range(n)) for j in range(n)]) for i in range(n)]

@@ -108,7 +108,7 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     height = product(cloth, near.normals.T) - near.offsets
     past = jnp.maximum(ratio - height * height / (4 * width) - 1, 0)
     ended = past / (1 + ratio)
-    distance = height + bend + h * past * ended
+    distance = height + bend + 2 * h * past * ended
     squares = _products(near.normals)
     ones = jnp.ones_like(squares[..., :1])
     alike = jnp.concatenate([ones, near.normals, squares], axis=-1)
@@ -125,8 +125,8 @@ def _blended(cloth, near, surface, thickness) -> Blended:
     push = 2 * share * short
     lost = share * short * short
     own = lost - weight * product(product(lost / around, alike), facing)
-    upward = push * (1 - height * ended / h)
-    along = -4 / width * own + push * (ended * (2 - ended) / (4 * h) - bend * ratio * shown / (2 * width))
+    upward = push * (1 - 2 * height * ended / h)
+    along = -4 / width * own + push * (ended * (2 - ended) / (2 * h) - bend * ratio * shown / (2 * width))
     pull = product(along, jnp.concatenate([ones, near.points], axis=-1))
     turn = product(push * shown, near.bends)
     slope = product(upward, near.normals) + 2 * (pull[..., :1] * cloth - pull[..., 1:]) + turn[..., 6:9]
@@ -150,7 +150,7 @@ def blended(
     """Contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
 
         shortfall = sum_i v_i min(d_i - thickness, 0)^2
-        d_i = z_i + g_i r_i . S_i r_i / 2 + h e_i^2 / (1 + q_i),   e_i = max(q_i - (z_i/2h)^2 - 1, 0)
+        d_i = z_i + g_i r_i . S_i r_i / 2 + 2 h e_i^2 / (1 + q_i),   e_i = max(q_i - (z_i/2h)^2 - 1, 0)
         r_i = x - b_i,   z_i = n_i . r_i,   q_i = |r_i|^2 / 4h^2,   S_i the shape operator at b_i,   g_i = 1/(1 + q_i^2)
         v_i = (1 + c) w_i / sum_j w_j (f_ij + c),   w_i = exp(-4 |r_i|^2 / h^2),   f_ij = n_i . n_j (1 + n_i . n_j) / 2
 
