@@ -244,7 +244,10 @@ def _simulate(options) -> int:
     io.write_animation(options.out, result.vertices, result.assembly.garment.faces, result.fps)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
-    print(f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g")
+    print(
+        f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g, "
+        f"median {np.median(result.seconds):.3g} s"
+    )
     for status, text in ((1, "out of iterations"), (2, "no step lowers the energy further"), (3, "not finite")):
         frames = np.flatnonzero(result.status == status)
         if frames.size:

@@ -41,13 +41,15 @@ class Progress:
 class Trajectory:
     """A simulated garment: vertices (frames, verts, 3) in m, and of every frame how its solve went, see `Solution`.
 
-    With substeps, `iterations` is their sum, and `residual` and `status` are the worst of them.
+    With substeps, `iterations` is their sum, and `residual` and `status` are the worst of them. `seconds` is the wall-clock
+    time of a frame; that of the first one of a run includes compiling.
     """
 
     vertices: np.ndarray
     iterations: np.ndarray
     residual: np.ndarray  # g
     status: np.ndarray
+    seconds: np.ndarray
     fps: float
     assembly: Assembly
 
@@ -104,6 +106,7 @@ def simulate(
         "iterations": np.zeros(0, np.int64),
         "residual": np.zeros(0),
         "status": np.zeros(0, np.int64),
+        "seconds": np.zeros(0),
     }
     if partial is not None and Path(partial).exists():
         done, state = _continued(Path(partial), identity, done, state)
@@ -112,6 +115,7 @@ def simulate(
     first = len(rows["status"])
     for t in range(first, frames):
         solutions: list[Solution] = []
+        started = time.monotonic()
         for k in range((t - 1) * spec.substeps + 1 if t else 0, t * spec.substeps + 1):
             state, x = _follow(simulator, settings, state, matrices[k])
             solutions.append(jax.device_get(state.solution))
@@ -120,6 +124,7 @@ def simulate(
         rows["residual"].append(max(float(s.residual) for s in solutions))
         rows["status"].append(max(int(s.status) for s in solutions))
         now = time.monotonic()
+        rows["seconds"].append(now - started)
         if report is not None:
             left = (now - begun) / (t + 1 - first) * (frames - 1 - t)
             report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
