@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -43,7 +44,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import BFGS, minimize
 
 from ncs_jax import InputError, Model, assemble, scene_from
 from ncs_jax.assembly import track_of
@@ -163,6 +163,8 @@ def fit(problem: Problem, wanted: Float[Array, "frames verts 3"], iterations: in
         return float(loss), np.asarray(gradient) / SCALE
 
     options = {"maxiter": iterations, "initial_tr_radius": RADIUS, "gtol": 1e-4, "xtol": 1e-5}
+    from scipy.optimize import BFGS, minimize
+
     minimize(objective, SCALE * np.log(GUESS), jac=True, hess=BFGS(), method="trust-constr", options=options)
     return np.array(seen), sum(count > 0 for count in failed)
 
@@ -252,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--iterations", type=int, default=60, help="of the fit, at most (default: 60)")
     parser.add_argument("--out", default="runs/fit_material", help="folder for the table and the picture")
     options = parser.parse_args(arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `ncs simulate` does
     try:
         rows = experiment(
             options.out,
