@@ -163,7 +163,7 @@ def fit(problem: Problem, wanted: Float[Array, "frames verts 3"], iterations: in
         return float(loss), np.asarray(gradient) / SCALE
 
     options = {"maxiter": iterations, "initial_tr_radius": RADIUS, "gtol": 1e-4, "xtol": 1e-5}
-    from scipy.optimize import BFGS, minimize
+    from scipy.optimize import BFGS, minimize  # here: its BLAS reads how many threads to take when it is loaded
 
     minimize(objective, SCALE * np.log(GUESS), jac=True, hess=BFGS(), method="trust-constr", options=options)
     return np.array(seen), sum(count > 0 for count in failed)
