@@ -301,8 +301,8 @@ def test_springs_of_an_equilateral_mesh_are_an_isotropic_membrane(strain):
 
 
 def images(f):
-    """Columns (2, 1, 3) of a 2x2 deformation."""
-    return jnp.pad(f.T, ((0, 0), (0, 1)))[:, None]
+    """Columns of a 2x2 deformation, of one face."""
+    return [[*column[:, None]] for column in jnp.pad(f.T, ((0, 0), (0, 1)))]
 
 
 @cache

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder, merge
+from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder, merge, recurrence
 
 JOINTS, NUMBERS, STATE = 5, 12, 24
 every_dtype = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -52,6 +52,30 @@ def test_rest_before_a_motion_changes_nothing(rng, dtype):
     assert jnp.any(alone)
     np.testing.assert_array_equal(after[6:], alone)
     np.testing.assert_array_equal(after[:6], 0)
+
+
+def test_the_recurrence_and_its_derivatives_are_those_of_its_steps(rng):
+    n = 7
+    recurrent, features, state = (jnp.asarray(rng.normal(size=s)) for s in ((n, 3 * n), (9, 4, 3 * n), (4, n)))
+    toward = jnp.asarray(rng.normal(size=(9, 4, n)))
+    step = DynamicEncoder(state=n, dtype=jnp.float64).apply
+
+    def stepwise(recurrent, features, state):
+        states = []
+        for f in features:
+            state = step({"params": {"recurrent": recurrent}}, state, f, method="step")
+            states.append(state)
+        return jnp.sum(toward * jnp.stack(states)), jnp.stack(states)
+
+    def whole(*given):
+        states = recurrence(*given)
+        return jnp.sum(toward * states), states
+
+    (_, expected), slopes = jax.jit(jax.value_and_grad(stepwise, (0, 1, 2), has_aux=True))(recurrent, features, state)
+    (_, found), gradients = jax.jit(jax.value_and_grad(whole, (0, 1, 2), has_aux=True))(recurrent, features, state)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    for a, b in zip(gradients, slopes, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
 
 
 def test_when_motion_stops_the_code_decays(rng):

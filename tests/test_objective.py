@@ -14,7 +14,7 @@ from ncs_jax.energies.collision import surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import mesh_from
-from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, distances, energies, total
+from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, distances, elastic, energies, total
 
 from .shapes import ball, rotation, sheet
 
@@ -189,6 +189,26 @@ def test_every_membrane_reads_its_own_numbers_in_order(model):
         alone = jax.jit(law)(x, garment.mesh, **{n: float(n == name) for n in names})
         np.testing.assert_allclose(slope, alone, rtol=1e-9)
         assert alone > 0
+
+
+@pytest.mark.parametrize("model", [*MEMBRANES, None])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_elements_differentiated_by_themselves_are_the_gradient_of_the_whole(model, dtype, rng):
+    """Of several poses beside each other, against automatic differentiation of each by itself."""
+    x, garment, numbers = jax.tree.map(
+        lambda a: a.astype(dtype) if a.dtype == jnp.float64 else a, (*situation()[:2], material(model or "stvk"))
+    )
+    terms = dataclasses.replace(ALL, **{**OFF, "membrane": model, "bending": True})
+    poses = x[..., None] + 1e-3 * jnp.asarray(rng.normal(size=(*x.shape, 3)), dtype)
+    parts, gradient = jax.jit(lambda x: elastic(x, garment, numbers, terms))(poses)
+    alone = jax.jit(jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, Frame(), terms).values())))
+    for i in range(3):
+        value, slope = alone(poses[..., i])
+        eps = jnp.finfo(dtype).eps
+        np.testing.assert_allclose(sum(parts.values())[i], value, rtol=50 * eps)
+        np.testing.assert_allclose(gradient[..., i], slope, atol=100 * eps * float(jnp.abs(slope).max()))
+    assert gradient.dtype == dtype and set(parts) == {"bending"} | ({"membrane"} if model else set())
+    assert all(part.dtype == dtype for part in parts.values())
 
 
 def test_the_scene_chooses_the_distance():

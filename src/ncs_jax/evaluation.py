@@ -13,12 +13,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.bending import angles
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.proximity import Groups, groups_from, intersecting
 from ncs_jax.kinematics import blend, skin, unpose
-from ncs_jax.mesh import dihedral
+from ncs_jax.mesh import corners
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.numerics import angle_between, norm
@@ -66,10 +67,9 @@ def _frame(
     heavy = mass > 0
     square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
     strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
-    w = deformation(x, mesh)
-    shear = jnp.abs(angle_between(w[0], w[1]) - np.pi / 2)
-    bend = dihedral(x[mesh.hinges], jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)) - mesh.hinge_angle
-    bend = bend - 2 * np.pi * jnp.round(bend / (2 * np.pi))
+    warp, weft = (jnp.stack(w, axis=-1) for w in deformation(x, mesh))
+    shear = jnp.abs(angle_between(warp, weft) - np.pi / 2)
+    bend = angles(corners(x, mesh.hinges), mesh)
     result = {
         "total": total,
         **parts,

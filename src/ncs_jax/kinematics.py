@@ -111,17 +111,16 @@ def blend_from(dense: np.ndarray, most: int = 8, dtype=jnp.float32) -> Blend:
     return Blend(jnp.asarray(kept / kept.sum(axis=1, keepdims=True), dtype), tuple(int(j) for j in used))
 
 
-def blend(matrices: Float[Array, "*frames joints 3 4"], weights: Blend) -> Float[Array, "*frames verts 3 4"]:
-    """Blended transform of every vertex, sum_j w_vj [R_j | t_j]."""
-    used = matrices[..., np.asarray(weights.joints), :, :]
-    flat = used.reshape(*used.shape[:-2], 12)
-    blended = jnp.einsum("vj,...jk->...vk", weights.weights, flat, precision="highest")
-    return blended.reshape(*blended.shape[:-1], 3, 4)
+def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[Array, "verts 3 4 *poses"]:
+    """Blended transform of every vertex, sum_j w_vj [R_j | t_j], in any number of poses."""
+    used = matrices[np.asarray(weights.joints)]
+    blended = jnp.matmul(weights.weights, used.reshape(used.shape[0], -1), precision="highest")
+    return blended.reshape(-1, *matrices.shape[1:])
 
 
-def skin(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+def skin(blended: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *poses"]) -> Float[Array, "verts 3 *poses"]:
     """Linear blend skinning: unposed positions to posed ones, m."""
-    return jnp.sum(blended[..., :3] * x[:, None, :], axis=-1) + blended[..., 3]
+    return sum((blended[:, :, i] * x[:, i, None] for i in range(3)), start=blended[:, :, 3])
 
 
 def unpose(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -9,9 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ncs_jax.numerics import normalize, signed_angle
+from ncs_jax.numerics import least_length
+from ncs_jax.vectors import Vector, cross, dot, length, minus, plus, times
 
-__all__ = ["Mesh", "dihedral", "material_axes", "mesh_from", "topology", "vertex_rings"]
+__all__ = ["Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Rings:
+    """Where a vertex stands in the elements around it: `corner * elements + element`, padded with `corners * elements`.
+
+    Gathering over it adds up the elements' forces without a scatter.
+    """
+
+    faces: Int[Array, "verts most_faces"]
+    edges: Int[Array, "verts most_edges"]
+    hinges: Int[Array, "verts most_hinges"]
 
 
 @jax.tree_util.register_dataclass
@@ -34,23 +49,63 @@ class Mesh:
     hinge_angle: Float[Array, "hinges"]
     hinge_length: Float[Array, "hinges"]
     hinge_area: Float[Array, "hinges 2"]
+    rings: Rings | None = None  # None in a part of a mesh
 
 
-def dihedral(x: Float[Array, "*hinges 4 3"], areas: Float[Array, "*hinges 2"]) -> Float[Array, "*hinges"]:
+def corners(x: Float[Array, "verts 3 *poses"], elements: Int[Array, "elements corners"]) -> list[Vector]:
+    """The places of the first corner of every element, of the second and so on: arrays (elements, *poses)."""
+    return [[p[:, i] for i in range(3)] for p in (x[elements[:, k]] for k in range(elements.shape[1]))]
+
+
+def spread(constant: Float[Array, "elements"], like: Float[Array, "elements *poses"]) -> Float[Array, "elements ..."]:
+    """An element's constant, to go with all the lanes."""
+    return constant.reshape(constant.shape + (1,) * (like.ndim - constant.ndim))
+
+
+def _normals(hinge: Sequence[Vector], areas: Sequence[Array]):
+    a, b, c, d = hinge
+    edge = minus(b, a)
+    return times(0.5 / areas[0], cross(edge, minus(c, a))), times(0.5 / areas[1], cross(minus(d, a), edge)), edge
+
+
+@jax.custom_jvp
+def dihedral(hinge: Sequence[Vector], areas: Sequence[Array]) -> Array:
     """Signed angle phi in (-pi, pi] between the two faces of a hinge; 0 where flat, opposite for mirrored folds.
 
-        phi = atan2((n0 x n1) . e, n0 . n1)
+        phi = atan2((n0 x n1) . e / |e|, n0 . n1),   dphi/dx_c = -|e| / (2 A0) n0 / |n0|^2,   likewise d,
+        dphi/dx_a = -(1 - t_c) dphi/dx_c - (1 - t_d) dphi/dx_d,   dphi/dx_b = -t_c dphi/dx_c - t_d dphi/dx_d,
+        t_c, t_d where the heights of the two faces stand on the edge, 0 at a and 1 at b
 
-    `x` holds the two ends of the edge and the vertex opposite in each face; the normals n0, n1 are taken per rest area
-    `areas` (m^2) so that products of them stay near 1 in float32, also in second derivatives. Exactly folded or collapsed
-    hinges have finite derivatives; a face of zero area gives angle 0.
+    `hinge` holds the two ends a, b of the edge and the vertex opposite in each face, c, d, see `corners`; the normals n0, n1
+    are taken per rest area `areas` (m^2) so that products of them stay near 1 in float32, also in second derivatives. Exactly
+    folded or collapsed hinges have finite derivatives; a face of zero area gives angle 0.
     """
-    a, b, c, d = jnp.moveaxis(x, -2, 0)
-    edge = b - a
-    n0 = jnp.cross(edge, c - a) / (2 * areas[..., 0, None])
-    n1 = jnp.cross(d - a, edge) / (2 * areas[..., 1, None])
-    sine = jnp.sum(jnp.cross(n0, n1) * normalize(edge), axis=-1)
-    return signed_angle(sine, jnp.sum(n0 * n1, axis=-1))
+    n0, n1, edge = _normals(hinge, areas)
+    long = length(edge)
+    return jnp.arctan2(dot(cross(n0, n1), edge) / jnp.where(long > 0, long, 1), dot(n0, n1))
+
+
+@dihedral.defjvp
+def _dihedral_jvp(primals, tangents):
+    hinge, areas = primals
+    n0, n1, edge = _normals(hinge, areas)
+    long = length(edge)
+    unit = times(1 / jnp.where(long > 0, long, 1), edge)
+
+    def outward(normal, area):
+        size = dot(normal, normal)
+        solid = size > least_length(size.dtype)
+        return times(jnp.where(solid, -0.5 * long / (area * jnp.where(solid, size, 1)), 0), normal)
+
+    def along(corner):
+        return dot(minus(corner, hinge[0]), unit) / jnp.where(long > 0, long, 1)
+
+    c, d = outward(n0, areas[0]), outward(n1, areas[1])
+    s, t = along(hinge[2]), along(hinge[3])
+    a = plus(times(s - 1, c), times(t - 1, d))
+    b = plus(times(-s, c), times(-t, d))
+    change = sum(dot(slope, moved) for slope, moved in zip((a, b, c, d), tangents[0], strict=True))
+    return dihedral(hinge, areas), change
 
 
 def topology(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,10 +200,10 @@ def mesh_from(
     edge_area = area[sides[:, 0]] + np.where(sides[:, 1] >= 0, area[sides[:, 1]], 0)
     weight = 2 / np.sqrt(3) * edge_area / np.where(length > 0, length, 1) ** 2 * (length > 0)
     inner = sides[:, 1] >= 0
-    h = x[hinges]
     hinge_area = area[sides[inner]]
     with jax.enable_x64(True):
-        angle = np.asarray(jax.jit(dihedral)(jnp.asarray(h), jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))))
+        areas = jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))
+        angle = np.asarray(jax.jit(lambda x, i, a: dihedral(corners(x, i), [a[:, 0], a[:, 1]]))(jnp.asarray(x), hinges, areas))
     array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
     return Mesh(
         rest=array(x),
@@ -163,15 +218,22 @@ def mesh_from(
         hinge_angle=array(angle),
         hinge_length=array(length[inner]),
         hinge_area=array(hinge_area),
+        rings=Rings(*(jnp.asarray(_places(e, len(x))) for e in (faces, edges, hinges))),
     )
+
+
+def _places(elements: np.ndarray, verts: int) -> np.ndarray:
+    """Where each vertex stands in the elements, as `Rings` has it."""
+    owner = elements.T.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    counts = np.bincount(owner, minlength=verts)
+    table = np.full((verts, max(int(counts.max(initial=0)), 1)), len(owner), np.int32)
+    slot = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table[owner[order], slot] = order
+    return table
 
 
 def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
     """Faces around each vertex (verts, most), padded with len(faces): gathering over it replaces a scatter."""
-    owner = np.asarray(faces).reshape(-1)
-    order = np.argsort(owner, kind="stable")
-    counts = np.bincount(owner, minlength=verts)
-    table = np.full((verts, max(int(counts.max(initial=0)), 1)), len(faces), np.int32)
-    slot = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    table[owner[order], slot] = order // 3
-    return table
+    places = _places(np.asarray(faces), verts)
+    return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)

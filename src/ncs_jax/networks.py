@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge"]
+__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge", "recurrence"]
 
 
 class StaticEncoder(nn.Module):
@@ -28,6 +28,64 @@ class StaticEncoder(nn.Module):
             layer = nn.Dense(size, param_dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")
             h = nn.relu(layer(h))
         return h
+
+
+def _cell(recurrent, state, features):
+    """One step of a gated recurrent unit without bias: the new state, the reset and update gates and the candidate."""
+    n = state.shape[-1]
+    gates = nn.sigmoid(features[..., : 2 * n] + state @ recurrent[:, : 2 * n])
+    reset, update = gates[..., :n], gates[..., n:]
+    candidate = jnp.tanh(features[..., 2 * n :] + (reset * state) @ recurrent[:, 2 * n :])
+    return update * state + (1 - update) * candidate, reset, update, candidate
+
+
+def _states(recurrent, features, state):
+    def step(h, f):
+        new, *inside = _cell(recurrent, h, f)
+        return new, (new, h, *inside)
+
+    return jax.lax.scan(step, state, features)[1]
+
+
+@jax.custom_vjp
+def recurrence(
+    recurrent: Float[Array, "code gates"], features: Float[Array, "frames *batch gates"], state: Float[Array, "*batch code"]
+) -> Float[Array, "frames *batch code"]:
+    """States of a gated recurrent unit, time leading: its steps in order, its weights' derivative as one product over all."""
+    return _states(recurrent, features, state)[0]
+
+
+def _recurrence_forward(recurrent, features, state):
+    states, *kept = _states(recurrent, features, state)
+    return states, (recurrent, *kept)
+
+
+def _recurrence_backward(saved, toward):
+    recurrent, before, reset, update, candidate = saved
+    n = before.shape[-1]
+
+    def step(later, frame):
+        slope, h, r, u, c = frame
+        slope = slope + later
+        to_candidate = slope * (1 - u) * (1 - c * c)
+        to_reset_state = to_candidate @ recurrent[:, 2 * n :].T
+        to_gates = jnp.concatenate([to_reset_state * h * r * (1 - r), slope * (h - c) * u * (1 - u)], axis=-1)
+        earlier = slope * u + to_reset_state * r + to_gates @ recurrent[:, : 2 * n].T
+        return earlier, jnp.concatenate([to_gates, to_candidate], axis=-1)
+
+    to_state, to_features = jax.lax.scan(
+        step, jnp.zeros_like(before[0]), (toward, before, reset, update, candidate), reverse=True
+    )
+
+    def product(a, b):
+        return a.reshape(-1, n).T @ b.reshape(-1, b.shape[-1])
+
+    to_gates, to_candidate = to_features[..., : 2 * n], to_features[..., 2 * n :]
+    to_recurrent = jnp.concatenate([product(before, to_gates), product(reset * before, to_candidate)], axis=1)
+    return to_recurrent, to_features, to_state
+
+
+recurrence.defvjp(_recurrence_forward, _recurrence_backward)
 
 
 class DynamicEncoder(nn.Module):
@@ -63,25 +121,16 @@ class DynamicEncoder(nn.Module):
 
     def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]) -> Float[Array, "*batch code"]:
         """One step of the gated recurrent unit."""
-        n = self.state
-        reset_update = nn.sigmoid(features[..., : 2 * n] + state @ self.recurrent[:, : 2 * n])
-        reset, update = reset_update[..., :n], reset_update[..., n:]
-        candidate = jnp.tanh(features[..., 2 * n :] + (reset * state) @ self.recurrent[:, 2 * n :])
-        return update * state + (1 - update) * candidate
+        return _cell(self.recurrent, state, features)[0]
 
     def __call__(
         self, descriptors: Float[Array, "frames *batch joints numbers"], state: Float[Array, "*batch code"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of a sequence, time leading, from a state; `lax.scan` over frames."""
+        """Codes of a sequence, time leading, from a state."""
         features = self.features(descriptors)
         if self.is_initializing():
             return self.step(state, features[0])[None]
-
-        def step(h, f):
-            h = self.step(h, f)
-            return h, h
-
-        return jax.lax.scan(step, state, features)[1]
+        return recurrence(self.recurrent, features, state)
 
 
 class Decoder(nn.Module):

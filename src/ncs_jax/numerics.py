@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-__all__ = ["angle_between", "norm", "normalize", "positive_part", "signed_angle"]
+__all__ = ["angle_between", "least_length", "norm", "normalize", "positive_part", "signed_angle"]
 
 SWEEPS = 30  # of Jacobi rotations, at most
 
 
-def _least(dtype):
+def least_length(dtype) -> float:
     """Length in the unit of the argument; under it a second derivative 1/length^2 nears the end of the range of the type."""
     return 1e-12 if dtype == jnp.float32 else 1e-100
 
@@ -23,7 +23,7 @@ def _least(dtype):
 def norm(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     """Euclidean length of the last axis; zero with zero derivatives where the row vanishes."""
     square = jnp.sum(x * x, axis=-1)
-    singular = square < _least(x.dtype) ** 2
+    singular = square < least_length(x.dtype) ** 2
     return jnp.where(singular, 0, jnp.sqrt(jnp.where(singular, 1, square)))
 
 
@@ -31,7 +31,7 @@ def normalize(x: Float[Array, "*rows n"]) -> Float[Array, "*rows n"]:
     """Unit vector along the last axis; zero with zero derivatives where the row vanishes."""
     # A direction does not depend on scale, so the scale is a constant to the derivative, and no power of it leaves the range.
     size = lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
-    singular = size < _least(x.dtype)
+    singular = size < least_length(x.dtype)
     x = jnp.where(singular, 1, x) / jnp.where(singular, 1, size)
     return jnp.where(singular, 0, x * jnp.sum(x * x, axis=-1, keepdims=True) ** -0.5)
 
@@ -39,7 +39,7 @@ def normalize(x: Float[Array, "*rows n"]) -> Float[Array, "*rows n"]:
 def signed_angle(sine: Float[Array, "*rows"], cosine: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
     """atan2(sine, cosine) for any common scale of the two; zero with zero derivatives where both vanish."""
     size = lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
-    singular = size < _least(size.dtype)
+    singular = size < least_length(size.dtype)
     size = jnp.where(singular, 1, size)
     return jnp.arctan2(jnp.where(singular, 0, sine) / size, jnp.where(singular, 1, cosine) / size)
 

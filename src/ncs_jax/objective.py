@@ -14,7 +14,7 @@ from ncs_jax.energies import baraff_witkin as _baraff_witkin
 from ncs_jax.energies import neo_hookean as _neo_hookean
 from ncs_jax.energies import stvk as _stvk
 from ncs_jax.energies.baraff_witkin import baraff_witkin
-from ncs_jax.energies.bending import bending
+from ncs_jax.energies.bending import bending, per_hinge
 from ncs_jax.energies.collision import (
     Surface,
     collision,
@@ -27,7 +27,8 @@ from ncs_jax.energies.collision import (
 from ncs_jax.energies.friction import friction
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
-from ncs_jax.energies.mass_spring import mass_spring
+from ncs_jax.energies.mass_spring import mass_spring, per_edge
+from ncs_jax.energies.membrane import per_face
 from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.proximity import Groups, nearby_pairs
@@ -35,9 +36,21 @@ from ncs_jax.energies.self_contact import self_contact
 from ncs_jax.energies.smooth_contact import blended, nearby_quadrics
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
-from ncs_jax.mesh import Mesh
+from ncs_jax.mesh import Mesh, corners
 
-__all__ = ["DENSITIES", "MEMBRANES", "Frame", "Garment", "Material", "Terms", "distances", "energies", "pressure", "total"]
+__all__ = [
+    "DENSITIES",
+    "MEMBRANES",
+    "Frame",
+    "Garment",
+    "Material",
+    "Terms",
+    "distances",
+    "elastic",
+    "energies",
+    "pressure",
+    "total",
+]
 
 MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
     "stvk": (stvk, ("lam", "mu")),
@@ -101,8 +114,8 @@ class Frame:
     """What one frame brings to the energies; `None` where no term asks for it."""
 
     dt: float | Float[Array, ""] = field(default=1 / 30)  # s
-    previous: Float[Array, "verts 3"] | None = None  # x_{t-1}
-    before: Float[Array, "verts 3"] | None = None  # x_{t-2}
+    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}
+    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}
     body: Float[Array, "body 3"] | None = None  # posed
     blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
     carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
@@ -146,17 +159,18 @@ def _self_contact(x, garment, material):
 
 
 def energies(
-    x: Float[Array, "verts 3"],
+    x: Float[Array, "verts 3 *poses"],
     garment: Garment,
     material: Material,
     frame: Frame,
     terms: Terms,
     surface: Surface | None = None,
-) -> dict[str, Float[Array, ""]]:
+) -> dict[str, Float[Array, "*poses"]]:
     """Every term of the total energy (10) by name, in J.
 
     Args:
-        x: (verts, 3) positions in m. garment, material: what is constant. frame: what this frame brings.
+        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity and inertia.
+        garment, material: what is constant. frame: what this frame brings.
         terms: which terms exist. surface: the touchable body, where there is collision.
 
     Self-contact is NaN where more pairs are near each other than its lists hold: an energy without some of them would be wrong.
@@ -192,6 +206,34 @@ def energies(
         with jax.named_scope("self_contact"):
             parts["self_contact"] = _self_contact(x, garment, material)
     return parts
+
+
+def elastic(
+    x: Float[Array, "verts 3 *poses"], garment: Garment, material: Material, terms: Terms
+) -> tuple[dict[str, Float[Array, "*poses"]], Float[Array, "verts 3 *poses"]]:
+    """Membrane and bending of any number of poses at once: their energies as in `energies`, in J, and the gradient in N.
+
+    The elements are differentiated by themselves and their forces gathered at the vertices, so that nothing is scattered; with
+    poses beside each other (verts, 3, poses) every corner is one run of memory.
+    """
+    mesh = garment.mesh
+    laws = {}
+    if terms.membrane in DENSITIES:
+        density = DENSITIES[terms.membrane]
+        laws["membrane"] = mesh.faces, mesh.rings.faces, lambda face: per_face(density, face, mesh, *material.membrane)
+    elif terms.membrane is not None:
+        laws["membrane"] = mesh.edges, mesh.rings.edges, lambda edge: per_edge(edge, mesh, *material.membrane)
+    if terms.bending:
+        laws["bending"] = mesh.hinges, mesh.rings.hinges, lambda hinge: per_hinge(hinge, mesh, material.bending)
+    parts, gradient = {}, jnp.zeros_like(x)
+    for name, (elements, ring, law) in laws.items():
+        with jax.named_scope(name):
+            energy, pull = jax.vjp(law, corners(x, elements))
+            (forces,) = pull(jnp.ones_like(energy))
+            forces = jnp.stack([jnp.stack(corner, axis=1) for corner in forces]).reshape(-1, *x.shape[1:])
+            parts[name] = jnp.sum(energy, axis=0)
+            gradient = sum((jnp.take(forces, at, axis=0, mode="fill", fill_value=0) for at in ring.T), start=gradient)
+    return parts, gradient
 
 
 def total(*arguments, **options) -> Float[Array, ""]:

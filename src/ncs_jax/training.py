@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from ncs_jax.methods.ncs import NCS, decode, garment_blend, initial_parameters, 
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
-from ncs_jax.objective import Frame, distances, energies, pressure
+from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
 from ncs_jax.scene import TrainingSpec
 
 __all__ = [
@@ -90,42 +90,72 @@ def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.nd
     return picked.reshape(count, batch).astype(np.int32)
 
 
-def _sample(model: Model, weights: Blend, offsets, matrices, inertia_share):
-    """Energy of one sample as a function of its last frame's offsets and the skinning weights."""
+def _pose(model: Model, weights: Blend, offsets, matrices):
+    """Vertices (verts, 3, *poses) in m from offsets, in m, and joint transforms (joints, 3, 4, *poses)."""
     rest = model.garment.mesh.rest
-    body = None if model.body is None else pose_body(model, matrices[0])
-    previous = before = None
-    if model.terms.inertia:
-        previous, before = (skin(blend(matrices[k], weights), rest + offsets[k]) for k in (1, 2))
-    carried = pressed = None
-    if model.terms.friction:
-        carried = skin(blend(matrices[0], weights), rest + offsets[1])
-        pressed = pressure(carried, body, model.surface, model.terms, model.material)
+    return skin(blend(matrices, weights), rest.reshape(rest.shape + (1,) * (offsets.ndim - 2)) + offsets)
 
-    def value(last, weights):
-        blended = blend(matrices[0], weights)
-        frame = Frame(1 / model.fps, previous, before, body, blended, carried, pressed)
-        parts = energies(skin(blended, rest + last), model.garment, model.material, frame, model.terms, model.surface)
-        if model.terms.inertia:
-            parts |= {name: parts[name] * inertia_share for name in ("inertia", "friction") if name in parts}
+
+def _alone(model: Model, terms: Terms, weights: Blend, x, earlier, matrices, inertia_share):
+    """The terms that look at one pose by itself: energies by name and derivatives by x and, with pins, by the weights."""
+    body = None if model.body is None else pose_body(model, matrices)
+    carried = pressed = None
+    if terms.friction:
+        carried = _pose(model, weights, earlier, matrices)
+        pressed = pressure(carried, body, model.surface, terms, model.material)
+    frame = Frame(1 / model.fps, body=body, carried=carried, pressed=pressed)
+
+    def value(x, weights):
+        at = replace(frame, blended=blend(matrices, weights)) if terms.pinning else frame
+        parts = energies(x, model.garment, model.material, at, terms, model.surface)
+        if terms.friction:
+            parts["friction"] = parts["friction"] * inertia_share
         return sum(parts.values()), parts
 
-    return value
+    if not terms.pinning:
+        slope, parts = jax.grad(value, has_aux=True)(x, weights)
+        return parts, slope, None
+    (slope, to_weights), parts = jax.grad(value, argnums=(0, 1), has_aux=True)(x, weights)
+    return parts, slope, to_weights.weights
 
 
-def _physics(model: Model, network: NCS, weights: Blend, offsets, matrices, inertia_share):
-    """Sample by sample, so that a sample's intermediates stay in cache: energies (batch,) and gradients (batch, verts, 3)."""
+def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
+    """Energies by term (poses,), and the gradients of their sum by the last frame's offsets and by the skinning weights.
 
-    def one(args):
-        value = _sample(model, weights, *args)
-        if network.learn_weights:
-            (_, parts), (g, w) = jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(args[0][0], weights)
-            return parts, g, w.weights
-        (_, parts), g = jax.value_and_grad(value, has_aux=True)(args[0][0], weights)
-        return parts, g, jnp.zeros(())
+    Args:
+        offsets: (history, verts, 3, poses) in m, the last frame first. matrices: (history, joints, 3, 4, poses).
+        inertia_share: (poses,) 1, or 0 where a pose has no past of its own.
 
-    parts, gradient, to_weights = lax.map(one, (offsets, matrices, inertia_share))
-    return parts, gradient, jnp.mean(to_weights, axis=0)
+    The poses lie beside each other in the vector lanes, but for the terms that look for what is near.
+    """
+    terms = model.terms
+    x, back = jax.vjp(lambda last, weights: _pose(model, weights, last, matrices[0]), offsets[0], weights)
+    parts, gradient = elastic(x, model.garment, model.material, terms)
+
+    previous = before = None
+    if terms.inertia:
+        previous, before = (_pose(model, weights, offsets[k], matrices[k]) for k in (1, 2))
+    together = Terms(None, bending=False, collision=None, gravity=terms.gravity, inertia=terms.inertia)
+
+    def simple(x):
+        some = energies(x, model.garment, model.material, Frame(1 / model.fps, previous, before), together)
+        if terms.inertia:
+            some["inertia"] = some["inertia"] * inertia_share
+        return jnp.sum(sum(some.values(), start=jnp.zeros((), x.dtype))), some
+
+    slope, some = jax.grad(simple, has_aux=True)(x)
+    parts, gradient = parts | some, gradient + slope
+    alone = replace(terms, membrane=None, bending=False, gravity=False, inertia=False)
+    if alone.collision is None and not (alone.pinning or alone.self_contact):
+        return parts, *back(gradient)
+
+    each = (x, offsets[1] if terms.friction else None, matrices[0], inertia_share)
+    each = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), each)
+    some, slope, to_weights = lax.map(lambda one: _alone(model, alone, weights, *one), each)
+    to_offsets, to_all = back(gradient + jnp.moveaxis(slope, 0, -1))
+    if to_weights is not None:
+        to_all = replace(to_all, weights=to_all.weights + jnp.sum(to_weights, axis=0))
+    return parts | some, to_offsets, to_all
 
 
 def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs):
@@ -156,23 +186,23 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
     if history > 1:
         earlier = decode(network, params, model, z[:-1])
         frames += [earlier[1], earlier[0]]
-    offsets = jnp.stack(frames, axis=1)
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
-    matrices = jnp.moveaxis(track.matrices[back], 1, 0)
+    matrices = jnp.moveaxis(track.matrices[back], 1, -1)
+    offsets = jnp.moveaxis(jnp.stack(frames), 1, -1)
     share = (jnp.arange(ends.shape[0]) >= augmented).astype(offsets.dtype)
-    weights = garment_blend(network, params, model)
-    parts, g, to_weights = _physics(model, network, weights, offsets, matrices, share)
-    (result,) = transpose(g / ends.shape[0])
+    weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
+    parts, g, to_weights = physics(model, weights, offsets, matrices, share)
+    (result,) = transpose(jnp.moveaxis(g, -1, 0) / ends.shape[0])
     if network.learn_weights:
-        _, pull = jax.vjp(lambda p: garment_blend(network, p, model).weights, params)
-        result = jax.tree.map(jnp.add, result, pull(to_weights)[0])
+        (more,) = pull(jax.tree.map(lambda w: w / ends.shape[0], to_weights))
+        result = jax.tree.map(jnp.add, result, more)
     return result, parts, (g, offsets)
 
 
 def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> tuple[TrainState, dict]:
     """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
     grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs)
-    sample_good = jnp.all(jnp.isfinite(g), axis=(1, 2)) & jnp.isfinite(sum(parts.values()))
+    sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
     good = jnp.all(sample_good) & jnp.isfinite(optax.tree.norm(grads))
 
     def accept(state):
@@ -182,8 +212,7 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
 
     def drop(state):
         worst = jnp.argmin(sample_good)
-        history = offsets.shape[1]
-        kept = state.fault.offsets.at[:history].set(offsets[worst])
+        kept = state.fault.offsets.at[: len(offsets)].set(offsets[..., worst])
         return state.params, state.optimiser, Fault(state.step, ends[worst], kept)
 
     params, opt, fault = lax.cond(good, accept, drop, state)
@@ -243,13 +272,18 @@ def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> 
     history = 3 if model.terms.inertia else 1
     back = jnp.maximum(frame - jnp.arange(history), track.start[frame])
     weights = garment_blend(network, params, model)
-    value = _sample(model, weights, fault.offsets[:history], track.matrices[back], 1.0)
+    matrices, share = track.matrices[back][..., None], jnp.ones(1, fault.offsets.dtype)
     last = fault.offsets[0]
+
+    def value(last):
+        offsets = fault.offsets[:history].at[0].set(last)
+        return {name: energy[0] for name, energy in physics(model, weights, offsets[..., None], matrices, share)[0].items()}
+
     if not bool(jnp.all(jnp.isfinite(last))):
         return f"step {int(fault.step)}, frame {frame}: the network's own output is not finite"
-    parts = jax.jit(lambda o: value(o, weights)[1])(last)
+    parts = jax.jit(value)(last)
     for name, energy in parts.items():
-        gradient = jax.jit(jax.grad(lambda o, n=name: value(o, weights)[1][n]))(last)
+        gradient = jax.jit(jax.grad(lambda o, n=name: value(o)[n]))(last)
         bad = ~np.isfinite(np.asarray(gradient)).all(axis=1)
         if not np.isfinite(float(energy)) or bad.any():
             vertex = int(bad.argmax()) if bad.any() else -1

@@ -169,9 +169,7 @@ def _scan_nearest(x, features, names, squared):
         return (jnp.where(closer, d, best[0]), jnp.where(closer, name, best[1])), None
 
     start = (jnp.full(x.shape[1:], jnp.inf, x.dtype), jnp.zeros(x.shape[1:], jnp.int32))
-    # A step of a few operations is worth unrolling; unrolled triangles only take long to compile.
-    unroll = 8 if squared is _squared_to_points else 1
-    return lax.scan(step, start, (features, names), unroll=unroll)[0]
+    return lax.scan(step, start, (features, names))[0]
 
 
 def _all(x, features, squared):

@@ -8,12 +8,16 @@ from jaxtyping import Array, Float
 __all__ = ["gravity"]
 
 
-def gravity(x: Float[Array, "verts 3"], mass: Float[Array, "verts"], acceleration: Float[Array, 3]) -> Float[Array, ""]:
+def gravity(
+    x: Float[Array, "verts 3 *poses"], mass: Float[Array, "verts"], acceleration: Float[Array, 3]
+) -> Float[Array, "*poses"]:
     """Potential energy in a uniform field in J: E = - sum_v m x . g.
 
     Args:
-        x: (verts, 3) in m. mass: (verts,) in kg. acceleration: (3,) g in m/s^2, any direction.
+        x: (verts, 3, *poses) in m. mass: (verts,) in kg. acceleration: (3,) g in m/s^2, any direction.
 
     Source: slides, equation (14).
     """
-    return -jnp.sum(jnp.sum(mass[:, None] * x, axis=0) * acceleration)  # no matrix product: accelerators round those
+    poses = (1,) * (x.ndim - 2)
+    moment = jnp.sum(mass.reshape(-1, 1, *poses) * x, axis=0)
+    return -jnp.sum(moment * acceleration.reshape(3, *poses), axis=0)  # no matrix product: accelerators round those

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ncs_jax.mesh import Mesh
-from ncs_jax.numerics import norm
+from ncs_jax.mesh import Mesh, corners, spread
+from ncs_jax.vectors import Vector, length, minus
 
-__all__ = ["mass_spring"]
+__all__ = ["mass_spring", "per_edge"]
 
 
-def mass_spring(x: Float[Array, "verts 3"], mesh: Mesh, stiffness) -> Float[Array, ""]:
+def per_edge(edge: Sequence[Vector], mesh: Mesh, stiffness) -> Float[Array, "edges *poses"]:
+    """Energy of every spring, J."""
+    now = length(minus(edge[1], edge[0]))
+    return stiffness / 2 * spread(mesh.edge_weight, now) * (now - spread(mesh.edge_length, now)) ** 2
+
+
+def mass_spring(x: Float[Array, "verts 3 *poses"], mesh: Mesh, stiffness) -> Float[Array, "*poses"]:
     """Energy of the edge springs in J.
 
         E = 1/2 k sum_edges w (l - l0)^2,  w = (2/sqrt(3)) (A0 + A1) / l0^2
@@ -20,9 +28,8 @@ def mass_spring(x: Float[Array, "verts 3"], mesh: Mesh, stiffness) -> Float[Arra
     resolution, there with Lame parameters lambda = mu = sqrt(3)/4 k.
 
     Args:
-        x: (verts, 3) positions in m. mesh: rest state. stiffness: k in N/m.
+        x: (verts, 3, *poses) positions in m. mesh: rest state. stiffness: k in N/m.
 
     An edge collapsed to a point has zero derivative. Source: Provot 1995; slides, cloth models.
     """
-    length = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
-    return stiffness / 2 * jnp.sum(mesh.edge_weight * (length - mesh.edge_length) ** 2)
+    return jnp.sum(per_edge(corners(x, mesh.edges), mesh, stiffness), axis=0)

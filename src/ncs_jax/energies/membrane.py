@@ -1,18 +1,35 @@
-"""What every membrane shares: the deformation gradient of a triangle in its material axes."""
+"""What the membranes that are made of faces share: the deformation gradient of a triangle in its material axes."""
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from collections.abc import Callable, Sequence
+
 from jaxtyping import Array, Float
 
-from ncs_jax.mesh import Mesh
+from ncs_jax.mesh import Mesh, corners, spread
+from ncs_jax.vectors import Vector, minus, plus, times
 
-__all__ = ["deformation"]
+__all__ = ["columns", "deformation", "per_face"]
+
+Columns = Sequence[Vector]  # w_u and w_v
 
 
-def deformation(x: Float[Array, "verts 3"], mesh: Mesh) -> Float[Array, "2 faces 3"]:
+def columns(face: Sequence[Vector], mesh: Mesh) -> Columns:
     """Images w_u, w_v of the unit material axes of every face: the two columns of F = dx/du (3x2), dimensionless."""
-    p = x[mesh.faces]
-    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    inverse = mesh.face_axes
-    return jnp.stack([e1 * inverse[:, 0, i, None] + e2 * inverse[:, 1, i, None] for i in (0, 1)])
+    e1, e2 = minus(face[1], face[0]), minus(face[2], face[0])
+
+    def part(k, i, edge):
+        return times(spread(mesh.face_axes[:, k, i], edge[0]), edge)
+
+    return [plus(part(0, i, e1), part(1, i, e2)) for i in (0, 1)]
+
+
+def deformation(x: Float[Array, "verts 3 *poses"], mesh: Mesh) -> Columns:
+    """The columns of every face's deformation gradient at x, in m."""
+    return columns(corners(x, mesh.faces), mesh)
+
+
+def per_face(density: Callable[..., Array], face: Sequence[Vector], mesh: Mesh, *numbers) -> Float[Array, "faces *poses"]:
+    """Energy of every face in J: its rest area times the density. A face of zero rest area has zero axes and weighs nothing."""
+    energy = density(columns(face, mesh), *numbers)
+    return spread(mesh.face_area, energy) * energy

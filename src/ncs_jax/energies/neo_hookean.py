@@ -5,21 +5,21 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ncs_jax.energies.membrane import deformation
-from ncs_jax.mesh import Mesh
-from ncs_jax.numerics import norm
+from ncs_jax.energies.membrane import Columns, per_face
+from ncs_jax.mesh import Mesh, corners
+from ncs_jax.vectors import cross, dot, length
 
 __all__ = ["density", "neo_hookean"]
 
 
-def density(w: Float[Array, "2 *faces 3"], lam, mu) -> Float[Array, "*faces"]:
+def density(w: Columns, lam, mu) -> Array:
     """Energy per rest area, J/m^2: mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2, with J = |w_u x w_v|."""
-    stretch = jnp.sum(w * w, axis=(0, -1)) - 2
-    area = norm(jnp.cross(w[0], w[1])) - 1
+    stretch = dot(w[0], w[0]) + dot(w[1], w[1]) - 2
+    area = length(cross(w[0], w[1])) - 1
     return mu / 2 * stretch - mu * area + (lam + mu) / 2 * area * area
 
 
-def neo_hookean(x: Float[Array, "verts 3"], mesh: Mesh, lam, mu) -> Float[Array, ""]:
+def neo_hookean(x: Float[Array, "verts 3 *poses"], mesh: Mesh, lam, mu) -> Float[Array, "*poses"]:
     """Compression-safe membrane energy in J.
 
         E = sum_faces A [ mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2 ],  J = |w_u x w_v|
@@ -29,8 +29,8 @@ def neo_hookean(x: Float[Array, "verts 3"], mesh: Mesh, lam, mu) -> Float[Array,
     least (`tests/test_energies.py`). Finite at zero area, where the derivative of J is taken as zero.
 
     Args:
-        x: (verts, 3) positions in m. mesh: rest state. lam, mu: Lame parameters times thickness, N/m.
+        x: (verts, 3, *poses) positions in m. mesh: rest state. lam, mu: Lame parameters times thickness, N/m.
 
     Source: Smith, de Goes, Kim 2018 (stable neo-Hookean), reduced here to a membrane without a logarithm.
     """
-    return jnp.sum(mesh.face_area * density(deformation(x, mesh), lam, mu))
+    return jnp.sum(per_face(density, corners(x, mesh.faces), mesh, lam, mu), axis=0)

@@ -69,6 +69,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
         edges=_take(mesh.edges, edges),
         edge_length=_take(mesh.edge_length, edges, 1),
         edge_weight=_take(mesh.edge_weight, edges),
+        rings=None,
     )
     whole = fits_faces & fits_hinges & fits_edges & fits_pairs
     return Patch(

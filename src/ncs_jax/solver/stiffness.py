@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.friction import SLIP, slipping
 from ncs_jax.energies.membrane import deformation
-from ncs_jax.mesh import Mesh, dihedral
+from ncs_jax.mesh import Mesh, corners, dihedral
 from ncs_jax.numerics import norm, normalize, positive_part
 from ncs_jax.objective import DENSITIES, Frame, Garment, Material, Terms
 
@@ -64,18 +64,18 @@ def _membrane(x, mesh: Mesh, density, numbers):
     A density depends on lengths and angles only, so seen in the face's own frame (t, s, n) its Hessian has two parts: that of
     the material within the plane, 4x4, and the stress, 2x2, which acts alike on all three axes. Each loses its negative part.
     """
-    w = deformation(x, mesh)
+    w = jnp.stack([jnp.stack(column, axis=-1) for column in deformation(x, mesh)])
     t, s = _plane(w)
     zero = jnp.zeros_like(w[..., 0])
-    flat = jnp.stack([jnp.sum(w * t[None], axis=-1), jnp.sum(w * s[None], axis=-1), zero], axis=-1)
-    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density(w, *numbers))), flat)
+    flat = jnp.stack([jnp.sum(w * t[None], axis=-1), jnp.sum(w * s[None], axis=-1), zero], axis=1)
+    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density([[*w[0]], [*w[1]]], *numbers))), flat)
 
     def column(i, a):
-        return along(jnp.zeros_like(flat).at[i, :, a].set(1))
+        return along(jnp.zeros_like(flat).at[i, a].set(1))
 
     out = [column(j, 2) for j in range(2)]
-    stress = jnp.stack([jnp.stack([out[j][i, :, 2] for j in range(2)]) for i in range(2)])
-    inner = jnp.stack([column(j, b)[:, :, a] for j in range(2) for b in range(2) for a in range(2)])
+    stress = jnp.stack([jnp.stack([out[j][i, 2] for j in range(2)]) for i in range(2)])
+    inner = jnp.stack([column(j, b)[:, a] for j in range(2) for b in range(2) for a in range(2)])
     inner = inner.reshape(2, 2, 2, 2, -1).transpose(3, 2, 0, 1, 4)  # (i, a, j, b, faces)
     inner = inner - stress[:, None, :, None] * jnp.eye(2, dtype=x.dtype)[None, :, None, :, None]
     material = positive_part(inner.reshape(4, 4, -1)).reshape(2, 2, 2, 2, -1)
@@ -125,7 +125,8 @@ def _springs(x, mesh: Mesh, stiffness):
 def _bending(x, mesh: Mesh, stiffness):
     """Gradients of the angles (hinges, 4, 3) and weights (hinges,): the Gauss-Newton part, which is what is definite."""
     areas = jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)
-    gradient = jax.grad(lambda h: jnp.sum(dihedral(h, areas)))(x[mesh.hinges])
+    gradient = jax.grad(lambda hinge: jnp.sum(dihedral(hinge, [areas[:, 0], areas[:, 1]])))(corners(x, mesh.hinges))
+    gradient = jnp.stack([jnp.stack(corner, axis=-1) for corner in gradient], axis=1)
     solid = jnp.all(mesh.hinge_area > 0, axis=-1)
     return gradient, jnp.where(solid, 2 * stiffness * mesh.hinge_length**2 / (8 * jnp.sum(areas, axis=-1)), 0)
 
