@@ -77,7 +77,8 @@ def searches(kind, exact):
     return jax.jit(lambda x, body, surface: function(x, body, surface, exact=exact))
 
 
-SURFACE = replace(surface_from(CLOTH, BALL, TRIANGLES), groups=3)
+USUAL = surface_from(CLOTH, BALL, TRIANGLES)
+SURFACE = replace(USUAL, vertex_lists=USUAL.vertex_lists[:5], face_lists=USUAL.face_lists[:5])
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -111,8 +112,25 @@ def test_these_poses_do_defeat_the_candidates():
         unproven += np.sum(~np.asarray(proven))
     assert wrong > 50 and unproven > 200
     # and on the skin they are proven with the usual number of groups, or the fast query would never be fast
-    usual = surface_from(CLOTH, BALL, TRIANGLES)
-    assert np.mean(searches("vertex", False)(jnp.asarray(CLOTH * 0.84), jnp.asarray(BALL), usual)[1]) > 0.9
+    assert np.mean(searches("vertex", False)(jnp.asarray(CLOTH * 0.84), jnp.asarray(BALL), USUAL)[1]) > 0.9
+
+
+@pytest.mark.parametrize("kind", ["vertex", "triangle"])
+def test_several_poses_at_once_are_searched_like_one(kind):
+    x, body = (jnp.stack([jnp.asarray(pose[i]) for pose in poses().values()], axis=-1) for i in (0, 1))
+    together, proven = searches(kind, True)(x, body, SURFACE)
+    for pose in range(x.shape[-1]):
+        alone, sure = searches(kind, True)(x[..., pose], body[..., pose], SURFACE)
+        np.testing.assert_array_equal(together[:, pose], alone)
+        np.testing.assert_array_equal(proven[:, pose], sure)
+
+
+def test_groups_are_listed_by_what_is_near_in_the_given_poses():
+    moved = [(CLOTH, np.roll(BALL, 1, axis=1)), (-CLOTH, np.roll(-BALL, 1, axis=1))]
+    surface = surface_from(CLOTH, BALL, TRIANGLES, posed=moved)
+    assert np.any(np.asarray(surface.vertex_lists) != np.asarray(USUAL.vertex_lists))
+    x, body = jnp.asarray(0.84 * CLOTH), jnp.asarray(moved[0][1])
+    assert np.mean(searches("vertex", False)(x, body, surface)[1]) > np.mean(searches("vertex", False)(x, body, USUAL)[1])
 
 
 def test_search_in_a_batch_where_one_pose_needs_repair():

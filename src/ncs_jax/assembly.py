@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
-from ncs_jax.energies.collision import surface_from
+from ncs_jax.energies.collision import Surface, surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
-from ncs_jax.kinematics import Skeleton, blend_from
+from ncs_jax.kinematics import Skeleton, blend, blend_from, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
-from ncs_jax.model import Model, local_rotations, smooth_weights, touchable, transfer_weights, used_joints
+from ncs_jax.model import Model, local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
 from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track, mirror, track
 from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
@@ -167,6 +167,8 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
         track = _training_track(scene, model, body, [motions[name] for name in scene.motion.files])
     else:
         model = _model(scene, prepared, body, garment, mesh, pins, dtype)
+    if model.body is not None:
+        model = replace(model, surface=_surface(scene, model, _submesh(body.faces, prepared.part, len(body.vertices)), track))
     return Assembly(scene, prepared, model, _network(scene, model), body, garment, track, motions)
 
 
@@ -205,10 +207,9 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         jnp.asarray(joints[kept], dtype), tuple(place[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
     )
     collides = len(prepared.part) > 0 and physics.collision.stiffness > 0
-    surface = body_points = body_blend = None
+    body_points = body_blend = None
     if collides:
-        faces, points = _submesh(body.faces, prepared.part, len(body.vertices)), body.vertices[prepared.part]
-        surface = surface_from(garment.vertices, points, faces, smooth=physics.collision.distance == "smooth")
+        points = body.vertices[prepared.part]
         body_blend, body_points = blend_from(body_weights[:, kept], dtype=dtype), jnp.asarray(points, dtype)
     membrane = None if physics.membrane.model == "none" else physics.membrane.model
     numbers = tuple(getattr(physics.membrane, n) for n in MEMBRANES[membrane][1]) if membrane else ()
@@ -246,7 +247,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         basis=jnp.asarray(prepared.basis, dtype),
         body=body_points,
         body_blend=body_blend,
-        surface=surface,
+        surface=None,
         terms=terms,
         inputs=tuple(place[j] for j in prepared.inputs.tolist()),
         source_joints=tuple(kept),
@@ -254,6 +255,20 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         fps=scene.motion.fps,
         moves=moves,
     )
+
+
+def _surface(scene, model: Model, faces, track: Track | None, samples: int = 8) -> Surface:
+    """The touchable body, its search prepared for what comes near what in a few poses of the motion."""
+
+    def posed(matrices):
+        return skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
+
+    poses = []
+    if track is not None:
+        frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
+        poses = list(zip(*map(np.asarray, jax.jit(jax.vmap(posed))(track.matrices[frames])), strict=True))
+    rest, body = np.asarray(model.garment.mesh.rest), np.asarray(model.body)
+    return surface_from(rest, body, faces, smooth=scene.physics.collision.distance == "smooth", posed=poses)
 
 
 def _training_track(scene, model: Model, body, records: list[io.MotionRecord]) -> Track:

@@ -118,7 +118,7 @@ def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[
     return blended.reshape(-1, *matrices.shape[1:])
 
 
-def skin(blended: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *poses"]) -> Float[Array, "verts 3 *poses"]:
+def skin(blended: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *#poses"]) -> Float[Array, "verts 3 *poses"]:
     """Linear blend skinning: unposed positions to posed ones, m."""
     return sum((blended[:, :, i] * x[:, i, None] for i in range(3)), start=blended[:, :, 3])
 

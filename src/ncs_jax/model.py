@@ -44,9 +44,9 @@ class Model:
     moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
 
 
-def pose_body(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, "body 3"]:
-    """The touchable body in one frame, m."""
-    return skin(blend(matrices, model.body_blend), model.body)
+def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
+    """The touchable body in one frame or several, m."""
+    return skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + (1,) * (matrices.ndim - 3)))
 
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -116,19 +116,19 @@ class Frame:
     dt: float | Float[Array, ""] = field(default=1 / 30)  # s
     previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}
     before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}
-    body: Float[Array, "body 3"] | None = None  # posed
+    body: Float[Array, "body 3 *poses"] | None = None  # posed
     blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
     carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
     pressed: Float[Array, "verts 3"] | None = None  # `pressure` there, N
 
 
 def distances(
-    x: Float[Array, "verts 3"],
-    body: Float[Array, "body 3"],
+    x: Float[Array, "verts 3 *poses"],
+    body: Float[Array, "body 3 *poses"],
     surface: Surface,
     terms: Terms,
-) -> Float[Array, "verts"]:
-    """Signed distance to the posed body in m by the scene's query."""
+) -> Float[Array, "verts *poses"]:
+    """Signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone."""
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
         return triangle_distance(x, body, surface, index)
@@ -169,7 +169,7 @@ def energies(
     """Every term of the total energy (10) by name, in J.
 
     Args:
-        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity and inertia.
+        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity, inertia and the "plane" collision.
         garment, material: what is constant. frame: what this frame brings.
         terms: which terms exist. surface: the touchable body, where there is collision.
 

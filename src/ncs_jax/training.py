@@ -60,7 +60,8 @@ class TrainState:
     fault: Fault
 
 
-ADAM = optax.scale_by_adam()
+BETAS = (0.9, 0.999)
+ADAM = optax.scale_by_adam(*BETAS)
 
 
 def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
@@ -135,18 +136,21 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
     previous = before = None
     if terms.inertia:
         previous, before = (_pose(model, weights, offsets[k], matrices[k]) for k in (1, 2))
-    together = Terms(None, bending=False, collision=None, gravity=terms.gravity, inertia=terms.inertia)
+    plane = "plane" if terms.collision == "plane" else None
+    together = Terms(None, bending=False, collision=plane, exact=terms.exact, gravity=terms.gravity, inertia=terms.inertia)
+    frame = Frame(1 / model.fps, previous, before, None if plane is None else pose_body(model, matrices[0]))
 
     def simple(x):
-        some = energies(x, model.garment, model.material, Frame(1 / model.fps, previous, before), together)
+        some = energies(x, model.garment, model.material, frame, together, model.surface)
         if terms.inertia:
             some["inertia"] = some["inertia"] * inertia_share
         return jnp.sum(sum(some.values(), start=jnp.zeros((), x.dtype))), some
 
     slope, some = jax.grad(simple, has_aux=True)(x)
     parts, gradient = parts | some, gradient + slope
-    alone = replace(terms, membrane=None, bending=False, gravity=False, inertia=False)
-    if alone.collision is None and not (alone.pinning or alone.self_contact):
+    collision = None if plane else terms.collision
+    alone = replace(terms, membrane=None, bending=False, collision=collision, gravity=False, inertia=False)
+    if alone.collision is None and not (alone.friction or alone.pinning or alone.self_contact):
         return parts, *back(gradient)
 
     each = (x, offsets[1] if terms.friction else None, matrices[0], inertia_share)
@@ -203,19 +207,22 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
     """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
     grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs)
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
-    good = jnp.all(sample_good) & jnp.isfinite(optax.tree.norm(grads))
+    # Columns first, which adds in vector lanes; a sum is finite only if everything in it is.
+    sums = [jnp.sum(jnp.sum(leaf, axis=0)) for leaf in jax.tree.leaves(grads)]
+    good = lax.optimization_barrier(jnp.all(sample_good) & jnp.isfinite(sum(sums)))
 
-    def accept(state):
-        updates, opt = ADAM.update(grads, state.optimiser)
-        size = step_size(spec, state.step, steps)
-        return jax.tree.map(lambda p, u: p - size * u, state.params, updates), opt, state.fault
+    def choose(new, old):  # a select where a branch would copy what it returns
+        return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
 
-    def drop(state):
-        worst = jnp.argmin(sample_good)
-        kept = state.fault.offsets.at[: len(offsets)].set(offsets[..., worst])
-        return state.params, state.optimiser, Fault(state.step, ends[worst], kept)
-
-    params, opt, fault = lax.cond(good, accept, drop, state)
+    # The barrier has the moments written in place before they are read: otherwise XLA copies the old ones, 100 MB a step.
+    opt = lax.optimization_barrier(choose(ADAM.update(grads, state.optimiser)[1], state.optimiser))
+    count = jnp.maximum(opt.count, 1)
+    mean, square = optax.tree.bias_correction(opt.mu, BETAS[0], count), optax.tree.bias_correction(opt.nu, BETAS[1], count)
+    size = step_size(spec, state.step, steps)
+    params = jax.tree.map(lambda p, m, v: jnp.where(good, p - size * m / (jnp.sqrt(v) + 1e-8), p), state.params, mean, square)
+    worst = jnp.argmin(sample_good)
+    fault = Fault(state.step, ends[worst], state.fault.offsets.at[: len(offsets)].set(offsets[..., worst]))
+    fault = choose(state.fault, fault)
     logs = {name: jnp.mean(value) for name, value in parts.items()}
     return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
 

@@ -6,6 +6,8 @@ integers and carries no derivative. The *distance* is then a smooth function of 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -14,8 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ncs_jax.mesh import topology, vertex_rings
+from ncs_jax.mesh import corners, topology, vertex_rings
 from ncs_jax.numerics import angle_between, normalize
+from ncs_jax.vectors import cross, direction, dot, minus
 
 __all__ = [
     "Surface",
@@ -33,16 +36,14 @@ __all__ = [
 ]
 
 
-WIDTH = 2
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Surface:
     """What collision needs to know once about the part of the body that a garment can touch.
 
     `cloth_blocks`, `vertex_blocks` and `face_blocks` are compact groups of cloth vertices, body vertices and body faces,
-    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group.
+    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. `vertex_lists` and
+    `face_lists` name the body groups that each cloth group searches first.
     """
 
     faces: Int[Array, "faces 3"]
@@ -53,7 +54,9 @@ class Surface:
     cloth_blocks: Int[Array, "blocks size"]
     cloth_place: Int[Array, "verts"]
     vertex_blocks: Int[Array, "clusters vertices"]
+    vertex_lists: Int[Array, "near_clusters blocks"]
     face_blocks: Int[Array, "groups triangles"]
+    face_lists: Int[Array, "near_groups blocks"]
     spacing: Float[Array, ""]  # mean edge length of the resting body, m
     groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
 
@@ -72,18 +75,43 @@ def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
     return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
 
 
-def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, smooth: bool = False) -> Surface:
+def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
+    """The `count` body groups nearest to each cloth group, in the mean over poses [(cloth, body)]; (count, cloth groups)."""
+    gap = np.zeros((len(cloth_blocks), len(body_blocks)))
+    for cloth, body in posed:
+        low, high, below, above = (
+            f(points[blocks].reshape(len(blocks), -1, 3), axis=1)
+            for points, blocks in ((cloth, cloth_blocks), (body, body_blocks))
+            for f in (np.min, np.max)
+        )
+        apart = np.maximum(np.maximum(below[None] - high[:, None], low[:, None] - above[None]), 0)
+        centres = (low + high)[:, None] / 2 - (below + above)[None] / 2
+        gap += np.linalg.norm(apart, axis=-1) + 1e-3 * np.linalg.norm(centres, axis=-1)
+    return np.argsort(gap, axis=1, kind="stable")[:, :count].T.astype(np.int32)
+
+
+def surface_from(
+    cloth: np.ndarray,
+    body: np.ndarray,
+    faces: np.ndarray,
+    *,
+    smooth: bool = False,
+    posed: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> Surface:
     """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body.
 
-    `smooth`: for `nearby_quadrics`, which takes more and smaller groups; otherwise for the searches, where the sizes were the
-    fastest measured with 1,000 and with 4,500 cloth vertices.
+    `posed`: the two in some poses of the motion, from which to tell what is usually near what; at rest where there is none.
+    `smooth`: for `nearby_quadrics`, which takes smaller groups of the body; otherwise for the searches, where the sizes are a
+    balance of what a group looks at, what it proves at once and what is left to be searched in full.
     """
-    cloth_size, body_size, groups = (24, 4, 40) if smooth else (40, 40, 12)
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else (16, 8, 24)
     cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
     cloth_blocks = compact_groups(cloth, cloth_size)
+    vertex_blocks, face_blocks = compact_groups(body, body_size), compact_groups(body[faces].mean(axis=1), body_size)
     place = np.zeros(len(cloth), np.int32)
     place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
+    posed = posed or [(cloth, body)]
     edges, sides, _ = topology(faces)
     key = np.sort(edges, axis=1) @ [len(body), 1]
     order = np.argsort(key)
@@ -99,8 +127,10 @@ def surface_from(cloth: np.ndarray, body: np.ndarray, faces: np.ndarray, *, smoo
         border=jnp.asarray(border),
         cloth_blocks=jnp.asarray(cloth_blocks),
         cloth_place=jnp.asarray(place),
-        vertex_blocks=jnp.asarray(compact_groups(body, body_size)),
-        face_blocks=jnp.asarray(compact_groups(body[faces].mean(axis=1), body_size)),
+        vertex_blocks=jnp.asarray(vertex_blocks),
+        vertex_lists=jnp.asarray(_lists(posed, cloth_blocks, vertex_blocks, groups)),
+        face_blocks=jnp.asarray(face_blocks),
+        face_lists=jnp.asarray(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
         spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
         groups=groups,
     )
@@ -112,11 +142,13 @@ def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> 
     return normalize(jnp.cross(b - a, c - a))
 
 
-def vertex_normals(body: Float[Array, "body 3"], surface: Surface) -> Float[Array, "body 3"]:
+def vertex_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
     """Area-weighted unit normals of the body's vertices."""
-    a, b, c = (body[surface.faces[:, i]] for i in range(3))
-    area = jnp.concatenate([jnp.cross(b - a, c - a), jnp.zeros_like(body[:1])])
-    return normalize(jnp.sum(area[surface.rings], axis=1))
+    a, b, c = corners(body, surface.faces)
+    area = jnp.stack(cross(minus(b, a), minus(c, a)), axis=1)
+    around = [jnp.take(area, at, axis=0, mode="fill", fill_value=0) for at in surface.rings.T]
+    total = sum(around, start=jnp.zeros_like(body))
+    return jnp.stack(direction([total[:, i] for i in range(3)]), axis=1)
 
 
 # --- search ---------------------------------------------------------------------------------------------------------
@@ -127,18 +159,9 @@ def _squared_to_points(x, points):
     return sum((x[i] - points[i]) ** 2 for i in range(3))
 
 
-def _squared_to_triangles(x, corners):
-    """Exact squared distance to triangles; `corners` is (3 corners, 3 components, ...)."""
-    a, b, c = corners
-
-    def dot(p, q):
-        return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
-
-    def minus(p, q):
-        return [p[i] - q[i] for i in range(3)]
-
-    def cross(p, q):
-        return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
+def _squared_to_triangles(x, triangle):
+    """Exact squared distance to triangles, corner by corner and component by component."""
+    a, b, c = triangle
 
     def to_segment(p, edge):
         length = dot(edge, edge)
@@ -156,26 +179,46 @@ def _squared_to_triangles(x, corners):
     return jnp.where(inside & (square > 0), plane, border)
 
 
-def _scan_nearest(x, features, names, squared):
-    """Nearest of a list of features to each lane of x, by a scan over the list (the fastest form on CPUs).
+def _closer(x, item, name, best, squared):
+    d = squared(x, item)
+    return jnp.where(d < best[0], d, best[0]), jnp.where(d < best[0], name, best[1])
 
-    `features` (list, ..., lanes or 1), `names` (list, ...): the distance and the name of the nearest one.
+
+def _farthest(shape, dtype):
+    return jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, jnp.int32)
+
+
+def _fold(step, start, items, many):
+    """`step(carried, item)` over the leading axis of every array in `items`, `many` of them in one turn of a scan.
+
+    XLA makes one loop of a whole turn, ten times faster on a CPU than a turn for each, where `items` holds every number in an
+    array of its own. The last item may come again.
     """
+    count = len(jax.tree.leaves(items)[0])
+    turns = np.minimum(np.arange(-(-count // many) * many), count - 1).reshape(-1, many)
+
+    def turn(carried, several):
+        for i in range(many):
+            carried = step(carried, jax.tree.map(lambda a, i=i: a[i], several))
+        return carried, None
+
+    return lax.scan(turn, start, jax.tree.map(lambda a: a[turns], items))[0]
+
+
+def _numbers(features):
+    """Of points (count, 3, *poses) or triangles (count, 3 corners, 3, *poses), each number by itself, (count, *poses)."""
+    return [_numbers(features[:, i]) for i in range(3)] if features.shape[1:2] == (3,) else features
+
+
+def _all(x, features, squared, many):
+    """Name of the nearest of all features to each of x, three components of (lanes,)."""
+    names = jnp.arange(len(jax.tree.leaves(features)[0]), dtype=jnp.int32)
 
     def step(best, item):
-        feature, name = item
-        d = squared(x, feature)
-        closer = d < best[0]
-        return (jnp.where(closer, d, best[0]), jnp.where(closer, name, best[1])), None
+        return _closer(x, *item, best, squared)
 
-    start = (jnp.full(x.shape[1:], jnp.inf, x.dtype), jnp.zeros(x.shape[1:], jnp.int32))
-    return lax.scan(step, start, (features, names))[0]
-
-
-def _all(x, features, squared):
-    """Search every feature: features (count, ..., 3) for x (lanes, 3)."""
-    lanes = jnp.moveaxis(features, -1, 1 if features.ndim == 2 else 2)
-    return _scan_nearest(x.T, lanes[..., None], jnp.arange(len(features), dtype=jnp.int32), squared)
+    items = (jax.tree.map(lambda a: a[:, None], features), names)
+    return _fold(step, _farthest(x[0].shape, x[0].dtype), items, many)[1]
 
 
 def _smallest(values, count):
@@ -203,73 +246,111 @@ def nearest_groups(cloth, grouped, count):
     return bound, chosen.T
 
 
-def _candidates(x, features, blocks, surface, squared):
-    """Nearest feature among the groups nearest to each cloth group, and whether no other group can hold a nearer one.
+def _boxes(points):
+    """Lowest and highest corners of bounding boxes, by component (boxes, *poses), of points (boxes, points, *poses)."""
+
+    def extreme(pick, component):
+        return functools.reduce(pick, [a[:, k] for a in component for k in range(a.shape[1])])
+
+    corners = points if isinstance(points[0], list) else [points]
+    components = list(zip(*corners, strict=True))
+    return [[extreme(pick, c) for c in components] for pick in (jnp.minimum, jnp.maximum)]
+
+
+def _least_gap(low, high, boxes, listed):
+    """Squared distance from boxes, by component (lanes, *poses), to the nearest box that is not listed (boxes, lanes)."""
+
+    def exclude(least, box):
+        (below, above), skip = box
+        apart = [jnp.maximum(jnp.maximum(below[i] - high[i], low[i] - above[i]), 0) for i in range(3)]
+        return jnp.minimum(least, jnp.where(skip, jnp.inf, dot(apart, apart)))
+
+    items = (jax.tree.map(lambda a: a[:, None], boxes), listed.reshape(listed.shape + (1,) * (low[0].ndim - 1)))
+    return _fold(exclude, jnp.full_like(low[0], jnp.inf), items, 16)
+
+
+def _candidates(x, grouped, blocks, lists, surface, squared):
+    """Nearest feature in the lists of each cloth group, and whether no other group can hold a nearer one.
 
     The gap between the two bounding boxes bounds every distance between two groups from below: a vertex whose nearest
-    candidate is closer than the gap to the first group left out has the right one for certain.
+    candidate is closer than the gap to every group that is not listed has the right one for certain.
     """
-    grouped = features[blocks]  # (clusters, size, [3 corners,] 3)
-    cloth = x[surface.cloth_blocks]
-    bound, chosen = nearest_groups(cloth, grouped, surface.groups)
-    listed = grouped[chosen].reshape(len(cloth), -1, *features.shape[1:])
-    names = blocks[chosen].reshape(len(cloth), -1)
-    # (list, [3 corners,] 3, cloth groups, 1) against x (3, cloth groups, lanes)
-    listed = jnp.moveaxis(listed, 0, -1)[..., None]
-    square, name = _scan_nearest(jnp.moveaxis(cloth, -1, 0), listed, names.T[..., None], squared)
-    proven = square <= bound[:, None]
-    place = surface.cloth_place
-    return name.reshape(-1)[place], proven.reshape(-1)[place]
+    cloth = [component[surface.cloth_blocks] for component in x]  # (cloth groups, lanes, *poses)
+    listed = jnp.zeros((len(blocks), lists.shape[1]), bool).at[lists, jnp.arange(lists.shape[1])].set(True)
+    bound = _least_gap(*_boxes(cloth), _boxes(grouped), listed)
+    names = blocks.reshape(blocks.shape + (1,) * (cloth[0].ndim - 1))
+
+    def step(best, at):
+        near, named = jax.tree.map(lambda a: a[at], grouped), names[at]  # (cloth groups, size, *poses)
+        for i in range(blocks.shape[1]):
+            item, name = jax.tree.map(lambda a, i=i: a[:, i, None], near), named[:, i]
+            best = _closer(cloth, item, name, best, squared)
+        return best, None
+
+    square, name = lax.scan(step, _farthest(cloth[0].shape, cloth[0].dtype), lists)[0]
+    rows = (-1, *x[0].shape[1:])
+    return name.reshape(rows)[surface.cloth_place], (square <= bound[:, None]).reshape(rows)[surface.cloth_place]
 
 
-def _repair(x, name, proven, features, squared, size=128):
+def _repair(x, name, proven, features, squared, many, size=64):
     """Search everything for the vertices whose candidate is not proven, a few at a time, until none is left."""
-    size = min(size, len(x))
-
-    def pending(state):
-        return ~jnp.all(state[1])
+    size = min(size, len(name))
 
     def mend(state):
         name, proven = state
-        rows = jnp.nonzero(~proven, size=size, fill_value=len(x))[0]
-        _, found = _all(x.at[rows].get(mode="clip"), features, squared)
+        rows = jnp.nonzero(~proven, size=size, fill_value=len(name))[0]
+        found = _all([component.at[rows].get(mode="clip") for component in x], features, squared, many)
         return name.at[rows].set(found, mode="drop"), proven.at[rows].set(True, mode="drop")
 
-    return lax.while_loop(pending, mend, (name, proven))[0]
+    return lax.while_loop(lambda state: ~jnp.all(state[1]), mend, (name, proven))[0]
 
 
-def _search(x, features, blocks, surface, squared, exact):
-    x, features = lax.stop_gradient(x), lax.stop_gradient(features)
-    name, proven = _candidates(x, features, blocks, surface, squared)
-    return (_repair(x, name, proven, features, squared) if exact else name), proven
+def _search(x, features, blocks, lists, surface, squared, many, exact):
+    x, features = _numbers(lax.stop_gradient(x)), _numbers(lax.stop_gradient(features))
+    grouped = jax.tree.map(lambda a: a[blocks], features)  # (groups, size, *poses)
+    name, proven = _candidates(x, grouped, blocks, lists, surface, squared)
+    if not exact:
+        return name, proven
+
+    def repair(one):
+        return _repair(*one, squared, many)
+
+    each = (x, name, proven, features)
+    if name.ndim == 1:
+        return repair(each), proven
+    return jnp.moveaxis(lax.map(repair, jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), each)), 0, -1), proven
 
 
 def nearest_vertex(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
-) -> tuple[Int[Array, "verts"], Bool[Array, "verts"]]:
+    x: Float[Array, "verts 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
+) -> tuple[Int[Array, "verts *poses"], Bool[Array, "verts *poses"]]:
     """Nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
 
     With `exact` the rest is searched in full, so the answer is that of a full search whatever the pose; without it the
-    candidates' best stands, and the second result tells which answers are certain.
+    candidates' best stands, and the second result tells which answers are certain. At most one axis of poses.
     """
-    return _search(x, body, surface.vertex_blocks, surface, _squared_to_points, exact)
+    return _search(x, body, surface.vertex_blocks, surface.vertex_lists, surface, _squared_to_points, 32, exact)
 
 
 def nearest_triangle(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
-) -> tuple[Int[Array, "verts"], Bool[Array, "verts"]]:
+    x: Float[Array, "verts 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
+) -> tuple[Int[Array, "verts *poses"], Bool[Array, "verts *poses"]]:
     """Nearest body triangle of every cloth vertex by exact point-triangle distance; results as in `nearest_vertex`."""
-    return _search(x, body[surface.faces], surface.face_blocks, surface, _squared_to_triangles, exact)
+    return _search(x, body[surface.faces], surface.face_blocks, surface.face_lists, surface, _squared_to_triangles, 2, exact)
 
 
 # --- distance -------------------------------------------------------------------------------------------------------
 
 
 def plane_distance(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], normals: Float[Array, "body 3"], index: Int[Array, "verts"]
-) -> Float[Array, "verts"]:
+    x: Float[Array, "verts 3 *poses"],
+    body: Float[Array, "body 3 *poses"],
+    normals: Float[Array, "body 3 *poses"],
+    index: Int[Array, "verts *poses"],
+) -> Float[Array, "verts *poses"]:
     """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
-    return jnp.sum(normals[index] * (x - body[index]), axis=-1)
+    normal, origin = (jnp.take_along_axis(table, index[:, None], axis=0) for table in (normals, body))
+    return jnp.sum(normal * (x - origin), axis=1)
 
 
 def triangle_distance(
@@ -350,15 +431,15 @@ def _pseudo_normal(body, surface, index, weights):
     return normalize(chosen)
 
 
-def collision(distance: Float[Array, "verts"], thickness, stiffness) -> Float[Array, ""]:
+def collision(distance: Float[Array, "verts *poses"], thickness, stiffness) -> Float[Array, "*poses"]:
     """Collision energy in J.
 
         E = k_c sum_v min(d(x_v) - eps, 0)^2
 
     Args:
-        distance: (verts,) signed distance to the posed body in m. thickness: eps in m. stiffness: k_c in J/m^2 a vertex.
+        distance: (verts, *poses) signed distance to the posed body in m. thickness: eps in m. stiffness: k_c in J/m^2 a vertex.
 
     Zero with zero derivative for cloth farther than eps; continuous in value and first derivative at eps.
     Source: slides, equation (12).
     """
-    return stiffness * jnp.sum(jnp.minimum(distance - thickness, 0) ** 2)
+    return stiffness * jnp.sum(jnp.minimum(distance - thickness, 0) ** 2, axis=0)
