@@ -208,7 +208,7 @@ def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
     codes = jax.jit(lambda p, t: window_codes(network, p, t, ends, frames, frames))(params, track)
     z_static, z_dynamic = (z[:, 0] for z in codes)
     np.testing.assert_allclose(static_codes(network, params, track.static), z_static, rtol=0, atol=1e-13)
-    offsets = np.asarray(decode(network, params, model, z_static + alpha * z_dynamic))
+    offsets = np.moveaxis(np.asarray(decode(network, params, model, z_static + alpha * z_dynamic)), -1, 0)
     blended = np.einsum("vj,fjab->fvab", model.blend.weights, np.asarray(track.matrices)[:, list(model.blend.joints)])
     unposed = np.asarray(model.garment.mesh.rest)[None] + offsets
     expected = np.einsum("fvab,fvb->fva", blended[..., :3], unposed) + blended[..., 3]

@@ -149,7 +149,7 @@ def test_the_merged_decoder_is_the_same_function(rng, dtype, modes):
     # biases and mode coefficients start at zero: give every parameter a part
     params = jax.tree.map(lambda a: a + jnp.asarray(0.1 * rng.normal(size=a.shape), dtype), params)
     offsets = network.apply({"params": params}, code, basis)
-    assert offsets.shape == (3, 7, 3) and offsets.dtype == dtype
+    assert offsets.shape == (7, 3, 3) and offsets.dtype == dtype
     one, one_params = merge(network, params, basis)
     assert "coefficients" not in one_params
     got = one.apply({"params": one_params}, code, basis)

@@ -34,7 +34,7 @@ BELOW: dict[str, set[str]] = {
     "mesh": {"numerics", "vectors"},
     "energies": {"numerics", "mesh", "vectors"},
     "descriptors": {"numerics", "rotations"},
-    "objective": {"energies", "kinematics", "mesh"},
+    "objective": {"energies", "kinematics", "mesh", "vectors"},
     "solver": {"energies", "mesh", "model", "numerics", "objective"},
     "simulator": {"energies", "kinematics", "model", "motion", "objective", "solver"},
     "model": {"energies", "kinematics", "objective", "rotations"},

@@ -65,7 +65,10 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
         result = 0.0
         for i, t in enumerate(np.asarray(ends)):
             at = [max(t - 2, 0), max(t - 1, 0), t]
-            x = [skin(blend(track.matrices[f], model.blend), model.garment.mesh.rest + offsets[k, i]) for k, f in enumerate(at)]
+            x = [
+                skin(blend(track.matrices[f], model.blend), model.garment.mesh.rest + offsets[:, :, k, i])
+                for k, f in enumerate(at)
+            ]
             frame = Frame(1 / model.fps, jax.lax.stop_gradient(x[1]), jax.lax.stop_gradient(x[0]))
             frame = dataclasses.replace(frame, body=pose_body(model, track.matrices[t]))
             result += total(x[2], model.garment, model.material, frame, model.terms, model.surface)

@@ -19,14 +19,19 @@ __all__ = ["Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from",
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Rings:
-    """Where a vertex stands in the elements around it: `corner * elements + element`, padded with `corners * elements`.
+    """What is around what in a whole mesh, so that elements read and forces add up without a scatter.
 
-    Gathering over it adds up the elements' forces without a scatter.
+    `faces` and `edges` tell where a vertex stands in them: `corner * elements + element`, padded with `corners * elements`.
+    `folds` are the hinges opposite the three corners of every face, padded with the number of hinges, and `turned` is -1 where
+    such a hinge sees the face from behind. `sides` are the two faces of a hinge, `behind` is -1 where it sees the second so.
     """
 
     faces: Int[Array, "verts most_faces"]
     edges: Int[Array, "verts most_edges"]
-    hinges: Int[Array, "verts most_hinges"]
+    folds: Int[Array, "faces 3"]
+    turned: Float[Array, "faces 3"]
+    sides: Int[Array, "hinges 2"]
+    behind: Float[Array, "hinges"]
 
 
 @jax.tree_util.register_dataclass
@@ -218,7 +223,26 @@ def mesh_from(
         hinge_angle=array(angle),
         hinge_length=array(length[inner]),
         hinge_area=array(hinge_area),
-        rings=Rings(*(jnp.asarray(_places(e, len(x))) for e in (faces, edges, hinges))),
+        rings=_rings(faces, edges, hinges, sides[inner], len(x), dtype),
+    )
+
+
+def _rings(faces, edges, hinges, sides, verts: int, dtype) -> Rings:
+    folds, turned = np.full(faces.shape, len(hinges), np.int32), np.ones(faces.shape)
+    each = np.arange(len(hinges))
+    for side in (0, 1):
+        around = faces[sides[:, side]]
+        corner = np.argmax(around == hinges[:, 2 + side, None], axis=1)
+        folds[sides[:, side], corner] = each
+        after = around[each, (corner + 1) % 3]
+        turned[sides[:, side], corner] = np.where(after == hinges[:, side], 1, -1)
+    return Rings(
+        jnp.asarray(_places(faces, verts)),
+        jnp.asarray(_places(edges, verts)),
+        jnp.asarray(folds),
+        jnp.asarray(turned, dtype),
+        jnp.asarray(sides, jnp.int32),
+        jnp.asarray(turned[sides[:, 1], corner], dtype),
     )
 
 

@@ -14,7 +14,7 @@ from ncs_jax.energies import baraff_witkin as _baraff_witkin
 from ncs_jax.energies import neo_hookean as _neo_hookean
 from ncs_jax.energies import stvk as _stvk
 from ncs_jax.energies.baraff_witkin import baraff_witkin
-from ncs_jax.energies.bending import bending, per_hinge
+from ncs_jax.energies.bending import bending, fold_gradient
 from ncs_jax.energies.collision import (
     Surface,
     collision,
@@ -37,6 +37,7 @@ from ncs_jax.energies.smooth_contact import blended, nearby_quadrics
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.kinematics import unpose
 from ncs_jax.mesh import Mesh, corners
+from ncs_jax.vectors import plus
 
 __all__ = [
     "DENSITIES",
@@ -217,23 +218,35 @@ def elastic(
     poses beside each other (verts, 3, poses) every corner is one run of memory.
     """
     mesh = garment.mesh
-    laws = {}
-    if terms.membrane in DENSITIES:
-        density = DENSITIES[terms.membrane]
-        laws["membrane"] = mesh.faces, mesh.rings.faces, lambda face: per_face(density, face, mesh, *material.membrane)
-    elif terms.membrane is not None:
-        laws["membrane"] = mesh.edges, mesh.rings.edges, lambda edge: per_edge(edge, mesh, *material.membrane)
-    if terms.bending:
-        laws["bending"] = mesh.hinges, mesh.rings.hinges, lambda hinge: per_hinge(hinge, mesh, material.bending)
     parts, gradient = {}, jnp.zeros_like(x)
-    for name, (elements, ring, law) in laws.items():
-        with jax.named_scope(name):
-            energy, pull = jax.vjp(law, corners(x, elements))
-            (forces,) = pull(jnp.ones_like(energy))
-            forces = jnp.stack([jnp.stack(corner, axis=1) for corner in forces]).reshape(-1, *x.shape[1:])
-            parts[name] = jnp.sum(energy, axis=0)
-            gradient = sum((jnp.take(forces, at, axis=0, mode="fill", fill_value=0) for at in ring.T), start=gradient)
+    face = corners(x, mesh.faces) if terms.bending or terms.membrane in DENSITIES else []
+    on_faces = [[jnp.zeros_like(face[0][0])] * 3] * 3 if face else []
+    if terms.membrane is not None:
+        with jax.named_scope("membrane"):
+            if terms.membrane in DENSITIES:
+                density = DENSITIES[terms.membrane]
+                energy, pull = jax.vjp(lambda face: per_face(density, face, mesh, *material.membrane), face)
+                (on_faces,) = pull(jnp.ones_like(energy))
+            else:
+                energy, pull = jax.vjp(lambda edge: per_edge(edge, mesh, *material.membrane), corners(x, mesh.edges))
+                gradient = _gathered(*pull(jnp.ones_like(energy)), mesh.rings.edges)
+            parts["membrane"] = jnp.sum(energy, axis=0)
+    if terms.bending:
+        with jax.named_scope("bending"):
+            energy, folds = fold_gradient(x, face, mesh, material.bending)
+            on_faces = [plus(a, b) for a, b in zip(on_faces, folds, strict=True)]
+            parts["bending"] = jnp.sum(energy, axis=0)
+    if face:
+        gradient = gradient + _gathered(on_faces, mesh.rings.faces)
     return parts, gradient
+
+
+def _gathered(forces, ring):
+    """Sum at every vertex (verts, 3, *poses) of the forces on the corners around it."""
+    forces = jnp.stack([jnp.stack(corner, axis=1) for corner in forces])
+    forces = forces.reshape(-1, *forces.shape[2:])
+    start = jnp.zeros((len(ring), *forces.shape[1:]), forces.dtype)
+    return sum((jnp.take(forces, at, axis=0, mode="fill", fill_value=0) for at in ring.T), start=start)
 
 
 def total(*arguments, **options) -> Float[Array, ""]:

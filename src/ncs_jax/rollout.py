@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -18,6 +19,8 @@ from ncs_jax.model import Model
 from ncs_jax.motion import Track, input_joints
 
 __all__ = ["Rollout", "State", "animate", "stepper"]
+
+BLOCK = 32  # frames of a motion decoded and skinned together
 
 
 @jax.tree_util.register_dataclass
@@ -98,11 +101,13 @@ def animate(
     z = static_codes(network, params, track.static)
     if network.dynamic is not None and alpha is not None:
         z = z + alpha * dynamic_codes(network, params, track)
-    decoded = decode(network, params, model, z)
     weights = garment_blend(network, params, model)
+    frames = len(z)
+    at = np.minimum(np.arange(-(-frames // BLOCK) * BLOCK), frames - 1).reshape(-1, BLOCK)  # equal frames stay equal
 
     def pose(args):
-        matrices, offsets = args
-        return skin(blend(matrices, weights), model.garment.mesh.rest + offsets)
+        matrices, z = args
+        x = model.garment.mesh.rest[..., None] + decode(network, params, model, z)
+        return jnp.moveaxis(skin(blend(jnp.moveaxis(matrices, 0, -1), weights), x), -1, 0)
 
-    return lax.map(pose, (track.matrices, decoded))
+    return lax.map(pose, (track.matrices[at], z[at])).reshape(-1, *model.garment.mesh.rest.shape)[:frames]

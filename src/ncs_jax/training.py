@@ -124,7 +124,7 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
     """Energies by term (poses,), and the gradients of their sum by the last frame's offsets and by the skinning weights.
 
     Args:
-        offsets: (history, verts, 3, poses) in m, the last frame first. matrices: (history, joints, 3, 4, poses).
+        offsets: (verts, 3, poses) in m of each frame, the last first. matrices: (history, joints, 3, 4, poses).
         inertia_share: (poses,) 1, or 0 where a pose has no past of its own.
 
     The poses lie beside each other in the vector lanes, but for the terms that look for what is near.
@@ -186,17 +186,16 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         return decode(network, params, model, z[-1]), z
 
     last, transpose, z = jax.vjp(last_frame, params, has_aux=True)
-    frames = [last]
+    offsets = [last]
     if history > 1:
         earlier = decode(network, params, model, z[:-1])
-        frames += [earlier[1], earlier[0]]
+        offsets += [earlier[:, :, 1], earlier[:, :, 0]]
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
-    offsets = jnp.moveaxis(jnp.stack(frames), 1, -1)
-    share = (jnp.arange(ends.shape[0]) >= augmented).astype(offsets.dtype)
+    share = (jnp.arange(ends.shape[0]) >= augmented).astype(last.dtype)
     weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
     parts, g, to_weights = physics(model, weights, offsets, matrices, share)
-    (result,) = transpose(jnp.moveaxis(g, -1, 0) / ends.shape[0])
+    (result,) = transpose(g / ends.shape[0])
     if network.learn_weights:
         (more,) = pull(jax.tree.map(lambda w: w / ends.shape[0], to_weights))
         result = jax.tree.map(jnp.add, result, more)
@@ -221,7 +220,8 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
     size = step_size(spec, state.step, steps)
     params = jax.tree.map(lambda p, m, v: jnp.where(good, p - size * m / (jnp.sqrt(v) + 1e-8), p), state.params, mean, square)
     worst = jnp.argmin(sample_good)
-    fault = Fault(state.step, ends[worst], state.fault.offsets.at[: len(offsets)].set(offsets[..., worst]))
+    kept = state.fault.offsets.at[: len(offsets)].set(jnp.stack([frame[..., worst] for frame in offsets]))
+    fault = Fault(state.step, ends[worst], kept)
     fault = choose(state.fault, fault)
     logs = {name: jnp.mean(value) for name, value in parts.items()}
     return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
@@ -270,7 +270,8 @@ def glance(model: Model, network: NCS, window: int, params, track: Track, ends) 
             result["penetrating"] = 100 * jnp.mean(d < 0)
         return result
 
-    return {k: jnp.mean(v) for k, v in lax.map(one, (offsets, track.matrices[ends])).items()}
+    each = (jnp.moveaxis(offsets, -1, 0), track.matrices[ends])
+    return {k: jnp.mean(v) for k, v in lax.map(one, each).items()}
 
 
 def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> str:
@@ -283,8 +284,8 @@ def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> 
     last = fault.offsets[0]
 
     def value(last):
-        offsets = fault.offsets[:history].at[0].set(last)
-        return {name: energy[0] for name, energy in physics(model, weights, offsets[..., None], matrices, share)[0].items()}
+        offsets = [frame[..., None] for frame in (last, *fault.offsets[1:history])]
+        return {name: energy[0] for name, energy in physics(model, weights, offsets, matrices, share)[0].items()}
 
     if not bool(jnp.all(jnp.isfinite(last))):
         return f"step {int(fault.step)}, frame {frame}: the network's own output is not finite"

@@ -76,8 +76,8 @@ def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
 
 
 def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
-    """The `count` body groups nearest to each cloth group, in the mean over poses [(cloth, body)]; (count, cloth groups)."""
-    gap = np.zeros((len(cloth_blocks), len(body_blocks)))
+    """The `count` body groups that come nearest to each cloth group in any pose [(cloth, body)]: (count, cloth groups)."""
+    least = np.full((len(cloth_blocks), len(body_blocks)), np.inf)
     for cloth, body in posed:
         low, high, below, above = (
             f(points[blocks].reshape(len(blocks), -1, 3), axis=1)
@@ -86,8 +86,8 @@ def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
         )
         apart = np.maximum(np.maximum(below[None] - high[:, None], low[:, None] - above[None]), 0)
         centres = (low + high)[:, None] / 2 - (below + above)[None] / 2
-        gap += np.linalg.norm(apart, axis=-1) + 1e-3 * np.linalg.norm(centres, axis=-1)
-    return np.argsort(gap, axis=1, kind="stable")[:, :count].T.astype(np.int32)
+        least = np.minimum(least, np.linalg.norm(apart, axis=-1) + 1e-3 * np.linalg.norm(centres, axis=-1))
+    return np.argsort(least, axis=1, kind="stable")[:, :count].T.astype(np.int32)
 
 
 def surface_from(
@@ -104,7 +104,7 @@ def surface_from(
     `smooth`: for `nearby_quadrics`, which takes smaller groups of the body; otherwise for the searches, where the sizes are a
     balance of what a group looks at, what it proves at once and what is left to be searched in full.
     """
-    cloth_size, body_size, groups = (24, 4, 40) if smooth else (16, 8, 24)
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else (16, 8, 32)
     cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
     cloth_blocks = compact_groups(cloth, cloth_size)
@@ -211,7 +211,7 @@ def _numbers(features):
 
 
 def _all(x, features, squared, many):
-    """Name of the nearest of all features to each of x, three components of (lanes,)."""
+    """Name of the nearest of all features (count, poses) to each of x, three components of (lanes, poses)."""
     names = jnp.arange(len(jax.tree.leaves(features)[0]), dtype=jnp.int32)
 
     def step(best, item):
@@ -292,33 +292,37 @@ def _candidates(x, grouped, blocks, lists, surface, squared):
     return name.reshape(rows)[surface.cloth_place], (square <= bound[:, None]).reshape(rows)[surface.cloth_place]
 
 
-def _repair(x, name, proven, features, squared, many, size=64):
-    """Search everything for the vertices whose candidate is not proven, a few at a time, until none is left."""
-    size = min(size, len(name))
+def _repair(x, name, proven, features, squared, many, size=32):
+    """Search everything for the vertices whose candidate is not proven, `size` of every pose at a time, until none is left.
 
-    def mend(state):
-        name, proven = state
-        rows = jnp.nonzero(~proven, size=size, fill_value=len(name))[0]
-        found = _all([component.at[rows].get(mode="clip") for component in x], features, squared, many)
-        return name.at[rows].set(found, mode="drop"), proven.at[rows].set(True, mode="drop")
+    `name` and `proven` (verts, poses), the components of x likewise.
+    """
+    verts, poses = proven.shape
+    size = min(size, verts)
+    # The numbers of the vertices to do, in every pose those first; past its end a pose has nothing to do.
+    place = jnp.where(proven, verts, jnp.cumsum(~proven, axis=0) - 1)
+    pose = jnp.arange(poses)
+    todo = jnp.full((verts + size, poses), verts, jnp.int32)
+    todo = todo.at[place, pose].set(jnp.arange(verts, dtype=jnp.int32)[:, None], mode="drop")
+    turns = -(-jnp.max(jnp.sum(~proven, axis=0)) // size)
 
-    return lax.while_loop(lambda state: ~jnp.all(state[1]), mend, (name, proven))[0]
+    def mend(turn, name):
+        rows = lax.dynamic_slice_in_dim(todo, turn * size, size)
+        found = _all([component.at[rows, pose].get(mode="clip") for component in x], features, squared, many)
+        return name.at[rows, pose].set(found, mode="drop")
+
+    return lax.fori_loop(0, turns, mend, name)
 
 
 def _search(x, features, blocks, lists, surface, squared, many, exact):
+    poses = x.shape[2:]
     x, features = _numbers(lax.stop_gradient(x)), _numbers(lax.stop_gradient(features))
     grouped = jax.tree.map(lambda a: a[blocks], features)  # (groups, size, *poses)
     name, proven = _candidates(x, grouped, blocks, lists, surface, squared)
     if not exact:
         return name, proven
-
-    def repair(one):
-        return _repair(*one, squared, many)
-
-    each = (x, name, proven, features)
-    if name.ndim == 1:
-        return repair(each), proven
-    return jnp.moveaxis(lax.map(repair, jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), each)), 0, -1), proven
+    one = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, features))
+    return _repair(*one, squared, many).reshape(-1, *poses), proven
 
 
 def nearest_vertex(
@@ -349,8 +353,12 @@ def plane_distance(
     index: Int[Array, "verts *poses"],
 ) -> Float[Array, "verts *poses"]:
     """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
-    normal, origin = (jnp.take_along_axis(table, index[:, None], axis=0) for table in (normals, body))
-    return jnp.sum(normal * (x - origin), axis=1)
+    # One row of six numbers for every vertex and pose is gathered several times faster than six numbers.
+    table = jnp.moveaxis(jnp.concatenate([normals, body], axis=1).reshape(len(body), 6, -1), 1, 2)
+    poses = table.shape[1]
+    rows = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
+    near = table.reshape(-1, 6).at[rows].get(mode="promise_in_bounds")
+    return sum(near[..., i].reshape(index.shape) * (x[:, i] - near[..., 3 + i].reshape(index.shape)) for i in range(3))
 
 
 def triangle_distance(

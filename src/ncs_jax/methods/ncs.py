@@ -59,7 +59,7 @@ def static_codes(
     return jnp.asarray(network.static.apply({"params": params["static"]}, descriptors))
 
 
-def decode(network: NCS, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "*frames verts 3"]:
+def decode(network: NCS, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "verts 3 *frames"]:
     """Offsets in unposed space, m."""
     return jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
 
@@ -83,7 +83,15 @@ def window_codes(
     z_static = static_codes(network, params, track.static[inside[length - last :]])
     if network.dynamic is None:
         return z_static, None
-    moving = jnp.where((back >= start[None])[..., None, None], track.dynamic[inside], 0)
-    rest = jnp.zeros((ends.shape[0], network.dynamic.state), moving.dtype)
-    z_dynamic = jnp.asarray(network.dynamic.apply({"params": params["dynamic"]}, moving, rest))
+    variables, begun = {"params": params["dynamic"]}, back >= start[None]
+    frames = len(track.dynamic)
+    if frames < back.size:  # windows overlap: what each frame gives by itself is computed once, and picked by a product
+        every = network.dynamic.apply(variables, track.dynamic, method="features")
+        pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
+        features = jnp.einsum("lbf,fg->lbg", pick, every)
+    else:
+        moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
+        features = network.dynamic.apply(variables, moving, method="features")
+    rest = jnp.zeros((ends.shape[0], network.dynamic.state), features.dtype)
+    z_dynamic = jnp.asarray(network.dynamic.apply(variables, features, rest, method="states"))
     return z_static, z_dynamic[length - last :]
