@@ -229,7 +229,8 @@ def elastic(
                 (on_faces,) = pull(jnp.ones_like(energy))
             else:
                 energy, pull = jax.vjp(lambda edge: per_edge(edge, mesh, *material.membrane), corners(x, mesh.edges))
-                gradient = _gathered(*pull(jnp.ones_like(energy)), mesh.rings.edges)
+                (on_edges,) = pull(jnp.ones_like(energy))
+                gradient = _gathered(on_edges, mesh.rings.edges)
             parts["membrane"] = jnp.sum(energy, axis=0)
     if terms.bending:
         with jax.named_scope("bending"):

@@ -54,8 +54,8 @@ def fold_gradient(
     normal = times(0.5 / area, cross(e[2], minus(face[2], face[0])))
 
     around = jnp.stack(normal, axis=1)
-    n0, n1 = ([p[:, i] for i in range(3)] for p in (around[mesh.rings.sides[:, k]] for k in (0, 1)))
-    n1 = times(spread(mesh.rings.behind, n1[0]), n1)
+    n0, second = ([p[:, i] for i in range(3)] for p in (around[mesh.rings.sides[:, k]] for k in (0, 1)))
+    n1 = times(spread(mesh.rings.behind, second[0]), second)
     a, b = corners(x, mesh.hinges[:, :2])
     edge = minus(b, a)
     long = length(edge)

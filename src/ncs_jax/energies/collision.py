@@ -358,7 +358,8 @@ def plane_distance(
     poses = table.shape[1]
     rows = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
     near = table.reshape(-1, 6).at[rows].get(mode="promise_in_bounds")
-    return sum(near[..., i].reshape(index.shape) * (x[:, i] - near[..., 3 + i].reshape(index.shape)) for i in range(3))
+    normal, origin = ([near[..., k + i].reshape(index.shape) for i in range(3)] for k in (0, 3))
+    return dot(normal, minus([x[:, i] for i in range(3)], origin))
 
 
 def triangle_distance(

@@ -86,12 +86,12 @@ def window_codes(
     variables, begun = {"params": params["dynamic"]}, back >= start[None]
     frames = len(track.dynamic)
     if frames < back.size:  # windows overlap: what each frame gives by itself is computed once, and picked by a product
-        every = network.dynamic.apply(variables, track.dynamic, method="features")
+        every = jnp.asarray(network.dynamic.apply(variables, track.dynamic, method="features"))
         pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
         features = jnp.einsum("lbf,fg->lbg", pick, every)
     else:
         moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
-        features = network.dynamic.apply(variables, moving, method="features")
+        features = jnp.asarray(network.dynamic.apply(variables, moving, method="features"))
     rest = jnp.zeros((ends.shape[0], network.dynamic.state), features.dtype)
     z_dynamic = jnp.asarray(network.dynamic.apply(variables, features, rest, method="states"))
     return z_static, z_dynamic[length - last :]
