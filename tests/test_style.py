@@ -41,6 +41,7 @@ BELOW: dict[str, set[str]] = {
     "motion": {"descriptors", "kinematics", "model"},
     "methods": {"descriptors", "kinematics", "model", "motion", "networks"},
     "rollout": {"descriptors", "kinematics", "methods", "model", "motion"},
+    "compression": {"methods", "model", "motion", "networks", "rollout"},
     "training": {"kinematics", "methods", "model", "motion", "numerics", "objective", "scene"},  # of `scene` the numbers alone
 }
 

@@ -70,6 +70,10 @@ def _parser() -> argparse.ArgumentParser:
     animate.add_argument(
         "--alpha", type=_finite, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates"
     )
+    animate.add_argument(
+        "--rank", type=_whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
+    )
+    animate.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
     animate.add_argument("--out", required=True, metavar="FILE", help=".npz, .h5, .pc2, or a folder of .obj")
 
     simulate = command("simulate", _simulate, "animate the garment of a scene by full-space simulation, without a network")
@@ -207,6 +211,8 @@ def _default_motions(scene) -> tuple[str, ...]:
 
 
 def _animate(options) -> int:
+    import numpy as np
+
     from ncs_jax import io
     from ncs_jax.runs import load_run
 
@@ -214,9 +220,19 @@ def _animate(options) -> int:
     motions = (options.motion,) if options.motion else _default_motions(run.assembly.scene)
     if not motions:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
-    vertices = run.animate(motions[0], options.alpha)
+    vertices, error = run.animate(motions[0], options.alpha), ""
+    if options.rank or options.bfloat16:
+        try:
+            smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
+        except ValueError as fault:
+            raise InputError(str(fault), field="--rank", value=options.rank) from fault
+        whole, vertices = vertices, smaller.animate(motions[0], options.alpha)
+        apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
+        error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     io.write_animation(options.out, vertices, run.assembly.garment.faces, run.assembly.model.fps)
-    print(f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices")
+    print(
+        f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices{error}"
+    )
     return 0
 
 

@@ -153,9 +153,10 @@ class DynamicEncoder(nn.Module):
 def outward(kernel: Float[Array, "inside outside"], x: Float[Array, "batch inside"]) -> Float[Array, "outside batch"]:
     """W^T x^T: a linear map whose many results lie first, so that poses stay beside each other in memory.
 
-    All three products of its derivative then read and write rows; on a CPU they run twice as fast as those of x W.
+    All three products of its derivative then read and write rows; on a CPU they run twice as fast as those of x W. A kernel in
+    bfloat16 is multiplied in that type and summed in float32.
     """
-    return jnp.einsum("io,bi->ob", kernel, x)
+    return jnp.einsum("io,bi->ob", kernel, x.astype(kernel.dtype), preferred_element_type=x.dtype)
 
 
 def _outward_backward(saved, toward):
@@ -195,6 +196,7 @@ class Decoder(nn.Module):
     modes: int = 128
     local: float = 0.005
     dtype: DTypeLike = jnp.float32
+    rank: int = 0  # numbers that the linear map goes through, in a decoder made smaller; 0: as it was trained
 
     def setup(self):
         """Create the layers."""
@@ -202,14 +204,23 @@ class Decoder(nn.Module):
         self.layers = [dense(n, kernel_init=nn.initializers.he_normal()) for n in self.sizes]
         small = nn.initializers.normal(0.3 / self.sizes[-1] ** 0.5)
         self.offsets = Outward(3 * self.verts, small, self.dtype)
+        if self.rank:
+            self.reduced = dense(self.rank)
         if self.modes:
             self.coefficients = Outward(3 * self.modes, nn.initializers.zeros, self.dtype)
 
-    def __call__(self, code: Float[Array, "*poses code"], basis: Float[Array, "verts modes"]) -> Float[Array, "verts 3 *poses"]:
-        """Offsets (verts, 3, *poses) in m to add to the rest garment."""
-        h = code.reshape(-1, code.shape[-1])
+    def features(self, code: Float[Array, "*poses code"]) -> Float[Array, "*poses features"]:
+        """What the linear map reads."""
+        h = code
         for layer in self.layers:
             h = nn.relu(layer(h))
+        return h
+
+    def __call__(self, code: Float[Array, "*poses code"], basis: Float[Array, "verts modes"]) -> Float[Array, "verts 3 *poses"]:
+        """Offsets (verts, 3, *poses) in m to add to the rest garment."""
+        h = self.features(code.reshape(-1, code.shape[-1]))
+        if self.rank:
+            h = self.reduced(h)
         offsets = self.local * self.offsets(h)
         if self.modes:
             coefficients = self.coefficients(h).reshape(self.modes, -1)

@@ -58,7 +58,8 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
         eye = jnp.broadcast_to(jnp.eye(3, dtype=rest.dtype), (n, 3, 3))
         joints = Joints(eye, eye, jnp.zeros((n, 3), rest.dtype))
         size = network.dynamic.state if network.dynamic is not None else 0
-        return State(jnp.zeros(size, rest.dtype), joints, joints, jnp.asarray(False))
+        state = State(jnp.zeros(size, rest.dtype), joints, joints, jnp.asarray(False))
+        return jax.tree.map(jnp.copy, state)  # no two of its arrays are one, so that a caller may donate it
 
     def step(state: State, rotations, translation, alpha=1.0):
         pose = forward(model.skeleton, rotations, translation)
@@ -97,7 +98,6 @@ def animate(
         track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
             dynamic (alpha = 0 gives the same vertices).
     """
-    network, params = for_inference(network, params, model)
     z = static_codes(network, params, track.static)
     if network.dynamic is not None and alpha is not None:
         z = z + alpha * dynamic_codes(network, params, track)

@@ -7,7 +7,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_run, write_prepared, write_run
+from ncs_jax.compression import compress
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
@@ -71,6 +72,12 @@ class Run:
         # The last frame is repeated up to a whole number of blocks: motions of many lengths share a compilation.
         padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % BLOCK)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
         return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, padded, float(alpha)))[:frames]
+
+    def compressed(self, motion: str | Track, *, rank: int = 0, bfloat16: bool = False) -> Run:
+        """This garment with a smaller decoder, made for what it does in a motion: see `compression.compress`."""
+        a, track = self.assembly, self.track(motion) if isinstance(motion, str) else motion
+        network, params = compress(a.network, self.params, a.model, track, rank=rank, bfloat16=bfloat16)
+        return replace(self, assembly=replace(a, network=network), params=params)
 
     def evaluate(self, motion: str | Track, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
         """Physical quantities per frame, see `evaluation.QUANTITIES` and `evaluation.measure`."""

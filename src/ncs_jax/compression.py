@@ -1,0 +1,56 @@
+"""A trained decoder made smaller for inference: fewer numbers, or shorter ones, for an error that can be stated in millimetres."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.methods.ncs import NCS, for_inference, static_codes
+from ncs_jax.model import Model
+from ncs_jax.motion import Track
+from ncs_jax.networks import Decoder
+from ncs_jax.rollout import dynamic_codes
+
+__all__ = ["compress"]
+
+
+def compress(
+    network: NCS, params: dict, model: Model, track: Track, *, rank: int = 0, bfloat16: bool = False
+) -> tuple[NCS, dict]:
+    """The same network with a smaller decoder, for `rollout.stepper` and `rollout.animate`.
+
+        offsets = b + K^T h  ~  (b + K^T m) + V (K V)^T (h - m)
+
+    with m the mean of the decoder's last features h over the frames of `track`, and V the `rank` leading right singular
+    vectors of the offsets there, (h - m) K: of all linear maps of that rank the one with the least squared error on the motion.
+    `bfloat16` stores the largest kernel in 16 bits and sums in float32; codes, skinning and positions stay as they are.
+
+    Args:
+        track: the motion to be good at. rank: at most the number of its frames; 0 keeps the map whole.
+
+    Raises:
+        ValueError: the rank is negative, or above what the motion or the decoder can tell apart.
+    """
+    network, params = for_inference(network, params, model)
+    decoder = dict(params["decoder"])
+    if rank:
+        z = static_codes(network, params, track.static)
+        if network.dynamic is not None:
+            z = z + dynamic_codes(network, params, track)
+        features = network.decoder.apply({"params": decoder}, z, method=Decoder.features)
+        h, kernel, bias = (np.asarray(a, np.float64) for a in (features, *map(decoder["offsets"].get, ("kernel", "bias"))))
+        if not 0 < rank <= min(h.shape):
+            raise ValueError(f"rank is {rank}; from {h.shape[0]} frames of {h.shape[1]} features it can be 1 to {min(h.shape)}")
+        mean = h.mean(axis=0)
+        _, _, directions = np.linalg.svd((h - mean) @ kernel, full_matrices=False)
+        basis = directions[:rank]
+        inward = kernel @ basis.T
+        dtype = decoder["offsets"]["kernel"].dtype
+        decoder["reduced"] = {"kernel": jnp.asarray(inward, dtype), "bias": jnp.asarray(-mean @ inward, dtype)}
+        decoder["offsets"] = {"kernel": jnp.asarray(basis, dtype), "bias": jnp.asarray(bias + mean @ kernel, dtype)}
+        network = replace(network, decoder=replace(network.decoder, rank=rank, parent=None, name=None))
+    if bfloat16:
+        decoder["offsets"] = {**decoder["offsets"], "kernel": decoder["offsets"]["kernel"].astype(jnp.bfloat16)}
+    return network, {**params, "decoder": decoder}
