@@ -1,4 +1,4 @@
-"""A trained decoder made smaller for inference: fewer numbers or shorter ones, for an error that can be stated in millimetres."""
+"""A trained decoder made smaller for inference: fewer numbers or shorter ones, for an error stated in millimetres."""
 
 from __future__ import annotations
 
