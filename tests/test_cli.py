@@ -308,6 +308,20 @@ def test_an_animation_of_another_motion_is_refused(run_folder, tmp_path, capsys)
     one_line(capsys, ["b.npz", "vertices", "(7, 30, 3)", "--motion"])
 
 
+def test_animate_with_a_smaller_decoder_tells_the_error(run_folder, tmp_path, capsys):
+    _, folder = run_folder
+    assert main(["animate", str(folder), "--out", str(tmp_path / "a.npz")]) == 0
+    assert "mm" not in capsys.readouterr().out
+    assert main(["animate", str(folder), "--out", str(tmp_path / "b.npz"), "--rank", "3", "--bfloat16"]) == 0
+    told = capsys.readouterr().out
+    a, b = (io.read_animation(tmp_path / name).vertices for name in ("a.npz", "b.npz"))
+    apart = 1000 * np.linalg.norm(a - b, axis=-1)
+    assert apart.max() > 0 and f"{apart.mean():.2g} mm from the whole decoder, {apart.max():.2g} at most" in told
+    assert main(["animate", str(folder), "--out", str(tmp_path / "c.npz"), "--rank", "1000"]) == 2
+    one_line(capsys, ["--rank", "1000"])
+    assert not (tmp_path / "c.npz").exists()
+
+
 def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, monkeypatch):
     _, folder = run_folder
     np.savez(tmp_path / "other.npz", **swing(frames=9))

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from ncs_jax.assembly import assemble
+from ncs_jax.energies.collision import vertex_normals
 from ncs_jax.kinematics import blend, skin
+from ncs_jax.model import pose_body
 from ncs_jax.objective import Frame, energies
 from ncs_jax.scene import load_scene, scene_from
 from ncs_jax.training import (
@@ -21,6 +23,7 @@ from ncs_jax.training import (
     glance,
     gradients,
     initial_state,
+    physics,
     step_size,
 )
 
@@ -44,6 +47,37 @@ def prepared(folder, changes=(), dtype=jnp.float32):
 def one_gradient(assembly, spec, params, ends, pairs):
     f = jax.jit(lambda model, params, track: gradients(model, assembly.network, spec, params, track, ends, pairs))
     return f(assembly.model, params, assembly.track)
+
+
+def test_single_precision_energies_agree_with_a_plain_double_precision_reference(tmp_path, rng):
+    """The batched path in float32 against every term of one pose after the other in float64, with every pair searched."""
+    assembly, _, ends, _ = prepared(tmp_path)
+    model, track, poses = assembly.model, assembly.track, np.asarray(ends[0])
+    back = np.maximum(poses[None] - np.arange(3)[:, None], 0)
+    matrices = jnp.moveaxis(track.matrices[back], 1, -1)
+    rest = model.garment.mesh.rest
+    offsets = [jnp.asarray(0.01 * rng.normal(size=(*rest.shape, len(poses))), jnp.float32) for _ in range(3)]
+    share = jnp.ones(len(poses), jnp.float32)
+    fast = jax.jit(lambda model, m, *offsets: physics(model, model.blend, offsets, m, share)[0])(model, matrices, *offsets)
+
+    def double(tree):
+        return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64) if a.dtype == jnp.float32 else a, tree)
+
+    exact, at = double(model), double((matrices, [rest[..., None] + offset for offset in offsets]))
+    for i in range(len(poses)):
+        x, previous, before = (skin(blend(at[0][k, ..., i], exact.blend), at[1][k][..., i]) for k in range(3))
+        terms = dataclasses.replace(model.terms, collision=None)
+        expected = energies(x, exact.garment, exact.material, Frame(1 / model.fps, previous, before), terms)
+        body = pose_body(exact, at[0][0, ..., i])
+        normals = np.asarray(vertex_normals(body, exact.surface))
+        apart = np.asarray(x)[:, None] - np.asarray(body)[None]
+        nearest = np.argmin(np.linalg.norm(apart, axis=-1), axis=1)
+        distance = np.sum(normals[nearest] * apart[np.arange(len(x)), nearest], axis=-1)
+        short = np.minimum(distance - float(exact.material.thickness), 0)
+        expected["collision"] = float(exact.material.collision) * np.sum(short**2)
+        assert expected.keys() == fast.keys() and expected["collision"] > 0
+        for name, value in expected.items():
+            np.testing.assert_allclose(fast[name][i], value, rtol=1e-5, err_msg=name)
 
 
 def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
