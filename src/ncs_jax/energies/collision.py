@@ -353,13 +353,14 @@ def plane_distance(
     index: Int[Array, "verts *poses"],
 ) -> Float[Array, "verts *poses"]:
     """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
-    # One row of six numbers for every vertex and pose is gathered several times faster than six numbers.
-    table = jnp.moveaxis(jnp.concatenate([normals, body], axis=1).reshape(len(body), 6, -1), 1, 2)
-    poses = table.shape[1]
-    rows = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
-    near = table.reshape(-1, 6).at[rows].get(mode="promise_in_bounds")
-    normal, origin = ([near[..., k + i].reshape(index.shape) for i in range(3)] for k in (0, 3))
-    return dot(normal, minus([x[:, i] for i in range(3)], origin))
+    poses = index[:1].size
+    at = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
+
+    def near(table):  # each component by itself, which on a CPU is gathered several times faster than rows of three
+        flat = [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
+        return [component.reshape(index.shape) for component in flat]
+
+    return dot(near(normals), minus([x[:, i] for i in range(3)], near(body)))
 
 
 def triangle_distance(
