@@ -51,7 +51,7 @@ def test_the_error_falls_with_the_rank_and_is_the_least_there_is(garment):
 def test_a_smaller_decoder_holds_fewer_numbers_and_streams_what_it_animates(garment):
     assembly, _params, motion, _track = garment
     network, fewer, vertices = smaller(garment, rank=3)
-    assert fewer["decoder"]["offsets"]["kernel"].shape == (3, vertices[0].size)
+    assert fewer["decoder"]["offsets"]["kernel"].shape == (vertices[0].size, 3)
     init, step = stepper(assembly.model, network, fewer)
     state, step = init(), jax.jit(step, donate_argnums=0)
     rotations = local_rotations(assembly.model, jnp.asarray(motion.poses, jnp.float64))

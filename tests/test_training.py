@@ -11,7 +11,7 @@ import pytest
 from ncs_jax.assembly import assemble
 from ncs_jax.energies.collision import vertex_normals
 from ncs_jax.kinematics import blend, skin
-from ncs_jax.model import pose_body
+from ncs_jax.model import pose_body, posed_bodies
 from ncs_jax.objective import Frame, energies
 from ncs_jax.scene import load_scene, scene_from
 from ncs_jax.training import (
@@ -153,6 +153,23 @@ def test_what_a_scene_lacks_is_not_traced(tmp_path, plain_jax, changes, absent):
     still = changes.get("motion.files") == []
     assert ("DynamicEncoder" in text) == (not still)
     assert ("dynamic" in initial_state(assembly.model, assembly.network, 0).params) == (not still)
+
+
+def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path):
+    assembly, spec, ends, pairs = prepared(tmp_path)
+    params = initial_state(assembly.model, assembly.network, 0).params
+    known = posed_bodies(assembly.model, assembly.track.matrices, 3)
+    assert known.shape == (len(assembly.track.start), len(assembly.model.body), 6)
+    expected, energies, _ = one_gradient(assembly, spec, params, ends[0], pairs[0])
+    f = jax.jit(
+        lambda model, params, track, known: gradients(model, assembly.network, spec, params, track, ends[0], pairs[0], known)
+    )
+    found, parts, _ = f(assembly.model, params, assembly.track, known)
+    for name, energy in energies.items():
+        np.testing.assert_allclose(parts[name], energy, rtol=1e-5, err_msg=name)
+    size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(expected))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * size)
 
 
 def test_energy_falls(tmp_path, plain_jax):

@@ -21,10 +21,10 @@ def compress(
 ) -> tuple[NCS, dict]:
     """The same network with a smaller decoder, for `rollout.stepper` and `rollout.animate`.
 
-        offsets = b + K^T h  ~  (b + K^T m) + V (K V)^T (h - m)
+        offsets = b + K h  ~  (b + K m) + V (V^T K) (h - m)
 
-    with m the mean of the decoder's last features h over the frames of `track`, and V the `rank` leading right singular
-    vectors of the offsets there, (h - m) K: of all linear maps of that rank the one with the least squared error on the motion.
+    with m the mean of the decoder's last features h over the frames of `track`, and V the `rank` leading singular vectors of
+    the offsets there, K (h - m): of all linear maps of that rank the one with the least squared error on the motion.
     `bfloat16` stores the largest kernel in 16 bits and sums in float32; codes, skinning and positions stay as they are.
 
     Args:
@@ -44,12 +44,12 @@ def compress(
         if not 0 < rank <= min(h.shape):
             raise ValueError(f"rank is {rank}; from {h.shape[0]} frames of {h.shape[1]} features it can be 1 to {min(h.shape)}")
         mean = h.mean(axis=0)
-        _, _, directions = np.linalg.svd((h - mean) @ kernel, full_matrices=False)
+        _, _, directions = np.linalg.svd((h - mean) @ kernel.T, full_matrices=False)
         basis = directions[:rank]
-        inward = kernel @ basis.T
+        inward = kernel.T @ basis.T
         dtype = decoder["offsets"]["kernel"].dtype
         decoder["reduced"] = {"kernel": jnp.asarray(inward, dtype), "bias": jnp.asarray(-mean @ inward, dtype)}
-        decoder["offsets"] = {"kernel": jnp.asarray(basis, dtype), "bias": jnp.asarray(bias + mean @ kernel, dtype)}
+        decoder["offsets"] = {"kernel": jnp.asarray(basis.T, dtype), "bias": jnp.asarray(bias + kernel @ mean, dtype)}
         network = replace(network, decoder=replace(network.decoder, rank=rank, parent=None, name=None))
     if bfloat16:
         decoder["offsets"] = {**decoder["offsets"], "kernel": decoder["offsets"]["kernel"].astype(jnp.bfloat16)}

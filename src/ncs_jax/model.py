@@ -8,14 +8,24 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from ncs_jax.energies.collision import Surface, closest_weights, nearest_triangle, surface_from
+from ncs_jax.energies.collision import Surface, closest_weights, nearest_triangle, surface_from, vertex_normals
 from ncs_jax.kinematics import Blend, Skeleton, blend, forward, skin, to_rest_axes, transforms
 from ncs_jax.objective import Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix
 
-__all__ = ["Model", "local_rotations", "pose_body", "smooth_weights", "touchable", "transfer_weights", "used_joints"]
+__all__ = [
+    "Model",
+    "local_rotations",
+    "pose_body",
+    "posed_bodies",
+    "smooth_weights",
+    "touchable",
+    "transfer_weights",
+    "used_joints",
+]
 
 
 @jax.tree_util.register_dataclass
@@ -47,6 +57,19 @@ class Model:
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
     """The touchable body in one frame or several, m."""
     return skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + (1,) * (matrices.ndim - 3)))
+
+
+def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:
+    """Positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
+    frames = len(matrices)
+    at = np.minimum(np.arange(-(-frames // lanes) * lanes), frames - 1).reshape(-1, lanes)
+
+    def some(matrices):
+        body = pose_body(model, jnp.moveaxis(matrices, 0, -1))
+        return jnp.concatenate([body, vertex_normals(body, model.surface)], axis=1)
+
+    blocks = lax.map(some, matrices[at])
+    return jnp.moveaxis(blocks, -1, 1).reshape(-1, *blocks.shape[1:3])[:frames]
 
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:

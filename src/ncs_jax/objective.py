@@ -121,6 +121,7 @@ class Frame:
     blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
     carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
     pressed: Float[Array, "verts 3"] | None = None  # `pressure` there, N
+    normals: Float[Array, "body 3 *poses"] | None = None  # of the body, where they are known already
 
 
 def distances(
@@ -128,22 +129,26 @@ def distances(
     body: Float[Array, "body 3 *poses"],
     surface: Surface,
     terms: Terms,
+    normals: Float[Array, "body 3 *poses"] | None = None,
 ) -> Float[Array, "verts *poses"]:
-    """Signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone."""
+    """Signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone.
+
+    `normals`: of the body's vertices, where they are known; "plane" works them out otherwise.
+    """
     if terms.collision == "triangle":
         index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
         return triangle_distance(x, body, surface, index)
     if terms.collision == "smooth":
         return blended(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
     index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
-    return plane_distance(x, body, vertex_normals(body, surface), index)
+    return plane_distance(x, body, vertex_normals(body, surface) if normals is None else normals, index)
 
 
-def _collision(x, body, surface, terms, material):
+def _collision(x, body, surface, terms, material, normals=None):
     if terms.collision == "smooth":
         near = nearby_quadrics(x, body, surface)
         return material.collision * jnp.sum(blended(x, near, surface, material.thickness).shortfall)
-    return collision(distances(x, body, surface, terms), material.thickness, material.collision)
+    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision)
 
 
 def pressure(
@@ -188,7 +193,7 @@ def energies(
             parts["bending"] = bending(x, mesh, material.bending)
     if terms.collision is not None:
         with jax.named_scope("collision"):
-            parts["collision"] = _collision(x, frame.body, surface, terms, material)
+            parts["collision"] = _collision(x, frame.body, surface, terms, material, frame.normals)
     if terms.friction:
         with jax.named_scope("friction"):
             parts["friction"] = friction(x, frame.carried, frame.pressed, material.friction, frame.dt)

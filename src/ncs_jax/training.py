@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
 from ncs_jax.methods.ncs import NCS, decode, garment_blend, initial_parameters, window_codes
-from ncs_jax.model import Model, pose_body
+from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
 from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
@@ -120,12 +120,12 @@ def _alone(model: Model, terms: Terms, weights: Blend, x, earlier, matrices, ine
     return parts, slope, to_weights.weights
 
 
-def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
+def physics(model: Model, weights: Blend, offsets, matrices, inertia_share, body=None):
     """Energies by term (poses,), and the gradients of their sum by the last frame's offsets and by the skinning weights.
 
     Args:
         offsets: (verts, 3, poses) in m of each frame, the last first. matrices: (history, joints, 3, 4, poses).
-        inertia_share: (poses,) 1, or 0 where a pose has no past of its own.
+        inertia_share: (poses,) 1, or 0 where a pose has no past of its own. body: (body, 6, poses) of `posed_bodies`, if known.
 
     The poses lie beside each other in the vector lanes, but for the terms that look for what is near.
     """
@@ -138,7 +138,12 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
         previous, before = (_pose(model, weights, offsets[k], matrices[k]) for k in (1, 2))
     plane = "plane" if terms.collision == "plane" else None
     together = Terms(None, bending=False, collision=plane, exact=terms.exact, gravity=terms.gravity, inertia=terms.inertia)
-    frame = Frame(1 / model.fps, previous, before, None if plane is None else pose_body(model, matrices[0]))
+    posed = normals = None
+    if body is not None:
+        posed, normals = body[:, :3], body[:, 3:]
+    elif plane is not None:
+        posed = pose_body(model, matrices[0])
+    frame = Frame(1 / model.fps, previous, before, posed, normals=normals)
 
     def simple(x):
         some = energies(x, model.garment, model.material, frame, together, model.surface)
@@ -162,7 +167,7 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share):
     return parts | some, to_offsets, to_all
 
 
-def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs):
+def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, known=None):
     """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
 
     Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample.
@@ -194,7 +199,8 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
     share = (jnp.arange(ends.shape[0]) >= augmented).astype(last.dtype)
     weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
-    parts, g, to_weights = physics(model, weights, offsets, matrices, share)
+    body = None if known is None else jnp.moveaxis(known[ends], 0, -1)
+    parts, g, to_weights = physics(model, weights, offsets, matrices, share, body)
     (result,) = transpose(g / ends.shape[0])
     if network.learn_weights:
         (more,) = pull(jax.tree.map(lambda w: w / ends.shape[0], to_weights))
@@ -202,9 +208,9 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
     return result, parts, (g, offsets)
 
 
-def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> tuple[TrainState, dict]:
+def step(model, network, spec, steps, state: TrainState, track, known, ends, pairs) -> tuple[TrainState, dict]:
     """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
-    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs)
+    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, known)
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
     # Columns first, which adds in vector lanes; a sum is finite only if everything in it is.
     sums = [jnp.sum(jnp.sum(leaf, axis=0)) for leaf in jax.tree.leaves(grads)]
@@ -219,10 +225,13 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
     mean, square = optax.tree.bias_correction(opt.mu, BETAS[0], count), optax.tree.bias_correction(opt.nu, BETAS[1], count)
     size = step_size(spec, state.step, steps)
     params = jax.tree.map(lambda p, m, v: jnp.where(good, p - size * m / (jnp.sqrt(v) + 1e-8), p), state.params, mean, square)
-    worst = jnp.argmin(sample_good)
-    kept = state.fault.offsets.at[: len(offsets)].set(jnp.stack([frame[..., worst] for frame in offsets]))
-    fault = Fault(state.step, ends[worst], kept)
-    fault = choose(state.fault, fault)
+
+    def first_bad():
+        worst = jnp.argmin(sample_good)
+        kept = state.fault.offsets.at[: len(offsets)].set(jnp.stack([frame[..., worst] for frame in offsets]))
+        return Fault(state.step, ends[worst], kept)
+
+    fault = lax.cond(good, lambda: state.fault, first_bad)
     logs = {name: jnp.mean(value) for name, value in parts.items()}
     return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
 
@@ -230,13 +239,17 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs) -> 
 def chunk_runner(network: NCS, spec: TrainingSpec):
     """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
 
-    `steps` is how many the whole training has, for the schedule. The state's buffers are reused.
+    `steps` is how many the whole training has, for the schedule. The state's buffers are reused. Where the chunk sees frames
+    more than once, the body is posed once for all its steps.
     """
 
     @functools.partial(jax.jit, donate_argnums=0)
     def run(state, ends, pairs, steps, model, track):
+        repeated = model.terms.collision == "plane" and len(track.start) < ends.size
+        known = posed_bodies(model, track.matrices, spec.batch) if repeated else None
+
         def body(state, indices):
-            return step(model, network, spec, steps, state, track, *indices)
+            return step(model, network, spec, steps, state, track, known, *indices)
 
         return lax.scan(body, state, (ends, pairs))
 

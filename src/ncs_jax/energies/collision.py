@@ -180,12 +180,20 @@ def _squared_to_triangles(x, triangle):
 
 
 def _closer(x, item, name, best, squared):
+    """The nearer of `best` and one more feature: squared distance and name as one complex number.
+
+    XLA computes the distance once for one array, and twice for two. A float32 holds names up to 2^24.
+    """
     d = squared(x, item)
-    return jnp.where(d < best[0], d, best[0]), jnp.where(d < best[0], name, best[1])
+    return jnp.where(d < best.real, lax.complex(d, jnp.broadcast_to(name, d.shape).astype(d.dtype)), best)
 
 
 def _farthest(shape, dtype):
-    return jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, jnp.int32)
+    return lax.complex(jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, dtype))
+
+
+def _name(best):
+    return best.imag.astype(jnp.int32)
 
 
 def _fold(step, start, items, many):
@@ -218,7 +226,7 @@ def _all(x, features, squared, many):
         return _closer(x, *item, best, squared)
 
     items = (jax.tree.map(lambda a: a[:, None], features), names)
-    return _fold(step, _farthest(x[0].shape, x[0].dtype), items, many)[1]
+    return _name(_fold(step, _farthest(x[0].shape, x[0].dtype), items, many))
 
 
 def _smallest(values, count):
@@ -247,14 +255,12 @@ def nearest_groups(cloth, grouped, count):
 
 
 def _boxes(points):
-    """Lowest and highest corners of bounding boxes, by component (boxes, *poses), of points (boxes, points, *poses)."""
+    """Lowest and highest corners of boxes, by component (boxes, *poses), around three components (boxes, points, *poses)."""
 
     def extreme(pick, component):
-        return functools.reduce(pick, [a[:, k] for a in component for k in range(a.shape[1])])
+        return functools.reduce(pick, [component[:, k] for k in range(component.shape[1])])
 
-    corners = points if isinstance(points[0], list) else [points]
-    components = list(zip(*corners, strict=True))
-    return [[extreme(pick, c) for c in components] for pick in (jnp.minimum, jnp.maximum)]
+    return [[extreme(pick, component) for component in points] for pick in (jnp.minimum, jnp.maximum)]
 
 
 def _least_gap(low, high, boxes, listed):
@@ -269,7 +275,7 @@ def _least_gap(low, high, boxes, listed):
     return _fold(exclude, jnp.full_like(low[0], jnp.inf), items, 16)
 
 
-def _candidates(x, grouped, blocks, lists, surface, squared):
+def _candidates(x, features, blocks, lists, surface, squared):
     """Nearest feature in the lists of each cloth group, and whether no other group can hold a nearer one.
 
     The gap between the two bounding boxes bounds every distance between two groups from below: a vertex whose nearest
@@ -277,19 +283,22 @@ def _candidates(x, grouped, blocks, lists, surface, squared):
     """
     cloth = [component[surface.cloth_blocks] for component in x]  # (cloth groups, lanes, *poses)
     listed = jnp.zeros((len(blocks), lists.shape[1]), bool).at[lists, jnp.arange(lists.shape[1])].set(True)
-    bound = _least_gap(*_boxes(cloth), _boxes(grouped), listed)
+    grouped = features[blocks]  # (groups, size, ..., 3, *poses)
+    points = jnp.moveaxis(grouped, features.ndim - x[0].ndim + 1, 0).reshape(3, len(blocks), -1, *x[0].shape[1:])
+    bound = _least_gap(*_boxes(cloth), _boxes(points), listed)
     names = blocks.reshape(blocks.shape + (1,) * (cloth[0].ndim - 1))
 
     def step(best, at):
-        near, named = jax.tree.map(lambda a: a[at], grouped), names[at]  # (cloth groups, size, *poses)
+        near, named = grouped[at], names[at]  # (cloth groups, size, ..., 3, *poses)
         for i in range(blocks.shape[1]):
-            item, name = jax.tree.map(lambda a, i=i: a[:, i, None], near), named[:, i]
-            best = _closer(cloth, item, name, best, squared)
+            item = jax.tree.map(lambda a: a[:, None], _numbers(near[:, i]))
+            best = _closer(cloth, item, named[:, i], best, squared)
         return best, None
 
-    square, name = lax.scan(step, _farthest(cloth[0].shape, cloth[0].dtype), lists)[0]
+    best = lax.scan(step, _farthest(cloth[0].shape, cloth[0].dtype), lists)[0]
     rows = (-1, *x[0].shape[1:])
-    return name.reshape(rows)[surface.cloth_place], (square <= bound[:, None]).reshape(rows)[surface.cloth_place]
+    proven = best.real <= bound[:, None]
+    return _name(best).reshape(rows)[surface.cloth_place], proven.reshape(rows)[surface.cloth_place]
 
 
 def _repair(x, name, proven, features, squared, many, size=32):
@@ -316,12 +325,11 @@ def _repair(x, name, proven, features, squared, many, size=32):
 
 def _search(x, features, blocks, lists, surface, squared, many, exact):
     poses = x.shape[2:]
-    x, features = _numbers(lax.stop_gradient(x)), _numbers(lax.stop_gradient(features))
-    grouped = jax.tree.map(lambda a: a[blocks], features)  # (groups, size, *poses)
-    name, proven = _candidates(x, grouped, blocks, lists, surface, squared)
+    x, features = _numbers(lax.stop_gradient(x)), lax.stop_gradient(features)
+    name, proven = _candidates(x, features, blocks, lists, surface, squared)
     if not exact:
         return name, proven
-    one = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, features))
+    one = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, _numbers(features)))
     return _repair(*one, squared, many).reshape(-1, *poses), proven
 
 
