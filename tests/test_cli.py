@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -225,13 +226,23 @@ def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, words):
 @pytest.mark.parametrize(
     "arguments",
     ["", "fly", "train ncs:tshirt", "train a --out b --steps 0", "train a --out b --seed=-1", "animate a --out b --alpha nan",
-     "demo --minutes 0"],
+     "demo --minutes 0", "train a --out b --hosts first,2,0", "train a --out b --hosts first:123,2,2",
+     "train a --out b --hosts first:65536,2,0"],
 )  # fmt: skip
 def test_wrong_options(capsys, arguments):
     with pytest.raises(SystemExit) as stop:
         main(arguments.split())
     assert stop.value.code == 2
     assert "usage: ncs" in capsys.readouterr().err
+
+
+def test_hosts_that_cannot_be_joined(capsys):
+    line = ["train", "ncs:tshirt", "--out", "nowhere", "--hosts"]
+    assert main([*line, "nowhere.invalid:1234,2,1"]) == 2
+    one_line(capsys, ["--hosts", "HOST:PORT,COUNT,RANK"])
+    with socket.create_server(("", 0)) as taken:
+        assert main([*line, f"localhost:{taken.getsockname()[1]},2,0"]) == 2
+    one_line(capsys, ["--hosts", "in use", "free port"])
 
 
 @pytest.mark.parametrize("command", ["demo", "train", "animate", "evaluate", "check"])

@@ -100,8 +100,14 @@ class Checkpoints:
     def __init__(self, run: Path):
         import orbax.checkpoint as ocp
 
-        options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True)
+        here = jax.process_index()  # whichever process this is, it waits for no other
+        alone = ocp.options.MultiprocessingOptions(here, active_processes={here}, barrier_sync_key_prefix=f"process {here}")
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True, create=False,
+            multiprocessing_options=alone,
+        )  # fmt: skip
         self._folder = (Path(run) / "checkpoints").absolute()
+        self._folder.mkdir(parents=True, exist_ok=True)
         self._manager = ocp.CheckpointManager(self._folder, options=options)
         self._args = ocp.args
 
@@ -112,7 +118,8 @@ class Checkpoints:
             InputError: the disk is full, or the folder is gone.
         """
         try:
-            self._manager.save(step, args=self._args.StandardSave(state))
+            # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
+            self._manager.save(step, args=self._args.StandardSave(jax.tree.map(np.asarray, state)))
             self._manager.wait_until_finished()
         except OSError as error:
             reason = error.strerror or str(error)
@@ -142,7 +149,7 @@ class Checkpoints:
             mend = "delete this folder to go back to the checkpoint before it"
             raise InputError(f"the checkpoint cannot be read: {reason}", file=self._folder / str(step), mend=mend) from error
         sys.unraisablehook = hook
-        return state
+        return jax.device_put(state)
 
     def close(self) -> None:
         """Wait for pending writes."""

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -34,10 +35,13 @@ def main(arguments: list[str] | None = None) -> int:
         return parsed.run(parsed)
     except InputError as error:
         print(f"ncs: {error}", file=sys.stderr)
-        return 2
+        code = 2
     except KeyboardInterrupt:
         print("ncs: interrupted; `ncs train --resume` goes on from the last checkpoint", file=sys.stderr)
-        return 130
+        code = 130
+    if getattr(parsed, "hosts", None) is not None:
+        _leave(code)
+    return code
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -63,6 +67,11 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=_seed, help="seed (default: the scene's)")
     train.add_argument("--resume", action="store_true", help="go on with the run in --out from its last checkpoint")
     train.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
+    train.add_argument(
+        "--hosts", type=_hosts, metavar="HOST:PORT,COUNT,RANK",
+        help="train with the same command on other hosts: the first one's address, how many there are, and which one this is, "
+        "from 0; `auto` asks the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU)",
+    )  # fmt: skip
 
     animate = command("animate", _animate, "animate a trained garment over a motion")
     animate.add_argument("folder", metavar="RUN", help="folder that ncs train made")
@@ -135,9 +144,64 @@ def _finite(text: str) -> float:
     return value
 
 
+def _hosts(text: str) -> dict:
+    """Arguments of `jax.distributed.initialize`."""
+    if text == "auto":
+        return {}
+    found = re.fullmatch(r"(.+):(\d+),(\d+),(\d+)", text)
+    if not found or not 0 < int(found[2]) < 65536 or int(found[4]) >= int(found[3]):
+        raise argparse.ArgumentTypeError(f"HOST:PORT,COUNT,RANK with RANK below COUNT, or auto, expected, found {text}")
+    every = {"cluster_detection_method": "deactivate"}  # all devices of this host, whoever started the command
+    address = f"{found[1]}:{found[2]}"
+    return {"coordinator_address": address, "num_processes": int(found[3]), "process_id": int(found[4]), **every}
+
+
+def _join(hosts: dict) -> None:
+    """Make this process one of those that train together; where they do not meet in five minutes, JAX ends it."""
+    import socket
+
+    import jax
+
+    jax.config.update("jax_enable_preemption_service", False)  # which would ignore SIGTERM
+    try:
+        if hosts:
+            address, port = hosts["coordinator_address"].rsplit(":", 1)
+            socket.getaddrinfo(address.strip("[]"), port)
+            if hosts["process_id"] == 0:
+                socket.create_server(("", int(port))).close()  # JAX itself crashes where another program has it
+            print("waiting for the other hosts", flush=True)
+        jax.distributed.initialize(**hosts)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0][:120]
+        mend = "give HOST:PORT,COUNT,RANK: HOST and a free port of the first one, the same on each"
+        raise InputError(f"the hosts do not find each other: {reason}", field="--hosts", mend=mend) from None
+
+
+def _leave(code: int) -> None:
+    """End a process that trains with others before they have finished; on the way out JAX would wait for them."""
+    import jax
+
+    if jax.distributed.is_initialized():
+        sys.stdout.flush()
+        os._exit(code)
+
+
 def _train(options) -> int:
-    run = _trained(options.scene, options.out, options.steps, options.minutes, options.seed, options.resume)
-    if options.preview:
+    import jax
+
+    if options.hosts is not None:
+        _join(options.hosts)
+    try:
+        run = _trained(options.scene, options.out, options.steps, options.minutes, options.seed, options.resume)
+    except jax.errors.JaxRuntimeError as error:
+        if options.hosts is None:
+            raise
+        reason = str(error).splitlines()[0][:250]
+        mend = "see what the other hosts say, then start the command on each again, with --resume"
+        raise InputError(f"training with the other hosts broke off: {reason}", field="--hosts", mend=mend) from error
+    if options.hosts is not None:
+        jax.distributed.shutdown()  # the others need not wait for the pictures
+    if options.preview and jax.process_index() == 0:
         _previews(run, options.out)
     return 0
 
@@ -165,12 +229,13 @@ def _previews(run, out) -> dict[str, float]:
 
 
 def _trained(scene, out, steps, minutes, seed, resume):
+    import jax
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ncs_jax.runs import train
 
-    console = Console()
+    console = Console(quiet=jax.process_index() > 0)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=None),
@@ -181,6 +246,9 @@ def _trained(scene, out, steps, minutes, seed, resume):
         task = progress.add_task("reading the scene and compiling", total=None)
 
         def show(r):
+            if jax.device_count() > 1 and progress.tasks[0].total is None:  # the first report
+                fewer = "" if r.devices == jax.device_count() else ": no more of them divide training.batch"
+                progress.print(f"training on {r.devices} of {jax.device_count()} devices{fewer}")
             parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
             text = (
                 f"step {r.step}/{r.steps}  [bold]{sum(r.energies.values()):.4f} J[/bold]  ({parts})\n"

@@ -19,6 +19,7 @@ from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.compression import compress
+from ncs_jax.devices import batch_mesh, copied, divided, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
@@ -31,7 +32,7 @@ __all__ = ["Report", "Run", "load_run", "train"]
 
 @dataclass(frozen=True)
 class Report:
-    """What training says after every chunk: the step, energies by term in J, strain and penetration in %, and the time."""
+    """What training says after every chunk: the step, energies by term in J, strain and penetration in %, time and devices."""
 
     step: int
     steps: int
@@ -43,6 +44,7 @@ class Report:
     left: float
     message: str = ""
     validation: dict[str, float] | None = None
+    devices: int = 1
 
 
 @dataclass(frozen=True)
@@ -120,15 +122,17 @@ def train(
     resume: bool = False,
     report: Callable[[Report], None] | None = None,
 ) -> Run:
-    """Train a garment from the physics energy alone.
+    """Train a garment from the physics energy alone, on every device that JAX sees.
 
     Args:
         scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
         steps: optimiser steps, else the scene's. minutes: instead, as many steps as fit. seed: else the scene's.
         resume: continue the run in `out`; its steps and seed stand. report: called after every chunk of steps.
 
+    After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
+
     Raises:
-        InputError: the scene or the folder is unusable.
+        InputError: the scene or the folder is unusable, or the hosts do not divide the batch.
     """
     scene = load_scene(scene) if isinstance(scene, str | Path) else scene
     began = time.monotonic()
@@ -146,14 +150,21 @@ def train(
     assembly = assemble(scene)
     spec, model, network, track = scene.training, assembly.model, assembly.network, assembly.track
     seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
-    run_chunk = chunk_runner(network, spec)
+    mesh = batch_mesh(spec.batch)
+    run_chunk = chunk_runner(network, spec, mesh)
+    everywhere = copied(mesh, (model, track))  # which waits for every process: from here on, one may write
+    if jax.process_index() > 0:
+        out = report = None
     look = jax.jit(lambda model, params, track, ends: glance(model, network, spec.window, params, track, ends))
     frames = track.start.shape[0]
 
     def indices(first, count):
         ends = batches(frames, spec.batch, seed, first, count)
         pairs = np.stack([np.random.default_rng([seed, 1, s]).permutation(spec.batch) for s in range(first, first + count)])
-        return jnp.asarray(ends), jnp.asarray(pairs.astype(np.int32))
+        return ends, pairs.astype(np.int32)
+
+    def run_steps(state, indices, steps):
+        return run_chunk(state, *divided(mesh, indices), steps, *everywhere)
 
     if out is not None and facts is None:
         write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict()})
@@ -167,11 +178,11 @@ def train(
     elif minutes is not None:
 
         def chunk(state):
-            state, _ = run_chunk(state, *indices(0, CHUNK), CHUNK, model, track)
-            look(model, state.params, track, jnp.arange(4) % frames)
+            state, _ = run_steps(state, indices(0, CHUNK), CHUNK)
+            look(model, local(mesh, state.params), track, jnp.arange(4) % frames)
             return jax.block_until_ready(state)
 
-        pace = _seconds(chunk, initial_state(model, network, seed)) / CHUNK
+        pace = _seconds(chunk, copied(mesh, initial_state(model, network, seed))) / CHUNK
         if scene.motion.validation:
             pace += _seconds(lambda s: _validate(Run(assembly, s.params)) and s, state) / check
         if checkpoints is not None and checkpoints.latest() is None:
@@ -179,6 +190,7 @@ def train(
             checkpoints.save(0, state)
             pace += (time.monotonic() - start) / every
         steps = max(CHUNK, int((60 * minutes - (time.monotonic() - began)) / (1.05 * pace)) // CHUNK * CHUNK)
+        steps = int(copied(mesh, steps))
     else:
         steps = steps or spec.steps
     if out is not None and (facts is None or not facts["steps"]):
@@ -187,22 +199,24 @@ def train(
 
     if resume and checkpoints is not None and checkpoints.latest() is not None:
         state = checkpoints.restore(state)
+    state = copied(mesh, state)
     first = int(state.step)
     log = None if out is None else _Log(out, first)
     dropped, started, pace = int(state.dropped), time.monotonic(), None
     for at, count in chunks(first, steps):
         ends, pairs = indices(at, count)
-        state, logs = run_chunk(state, ends, pairs, steps, model, track)
+        state, logs = run_steps(state, (ends, pairs), steps)
+        here, logs = local(mesh, (state, logs))
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         done = at + count
-        seen = {k: float(v) for k, v in look(model, state.params, track, ends[-1, :4]).items()}
+        seen = {k: float(v) for k, v in look(model, here.params, track, ends[-1, :4]).items()}
         message = ""
-        if int(state.dropped) > dropped:
-            dropped = int(state.dropped)
-            message = diagnose(model, network, state.params, track, state.fault)
+        if int(here.dropped) > dropped:
+            dropped = int(here.dropped)
+            message = diagnose(model, network, here.params, track, here.fault)
         validation = None
         if scene.motion.validation and (done % check == 0 or done == steps):
-            validation = _validate(Run(assembly, state.params))
+            validation = _validate(Run(assembly, here.params))
         now = time.monotonic()
         if pace is None:  # the first chunk compiles: it does not count for the pace
             pace, started = 0.0, now
@@ -210,19 +224,19 @@ def train(
             pace = (now - started) / (done - first - min(CHUNK, count))
         entry = Report(
             done, steps, energies, seen["strain"], seen.get("penetrating", 0.0), dropped, now - began,
-            pace * (steps - done), message, validation,
+            pace * (steps - done), message, validation, 1 if mesh is None else mesh.size,
         )  # fmt: skip
         if log is not None:
             log.write(entry)
         if report is not None:
             report(entry)
         if checkpoints is not None and (done % every == 0 or done == steps):
-            checkpoints.save(done, state)
+            checkpoints.save(done, here)
     if checkpoints is not None:
         checkpoints.close()
     if log is not None:
         log.close()
-    return Run(assembly, state.params, steps)
+    return Run(assembly, local(mesh, state.params), steps)
 
 
 def _seconds(work: Callable, state) -> float:

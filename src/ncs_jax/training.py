@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import lax
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
@@ -167,14 +169,21 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share, body
     return parts | some, to_offsets, to_all
 
 
-def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, known=None):
+def gradients(
+    model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, known=None, axis: str | None = None
+):
     """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
 
     Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample.
     Positions before the last frame enter as constants, so only that frame is differentiated through the decoder.
+    Within a `shard_map` over `axis`, `ends`, `pairs` and what is returned of samples are this device's share of the batch.
     """
     history = 3 if model.terms.inertia else 1
     augmented = round(spec.motion_augmentation * spec.batch) if network.dynamic is not None else 0
+    number = jnp.arange(ends.shape[0], dtype=ends.dtype)  # in the whole batch
+    if axis is not None:
+        number = number + lax.axis_index(axis) * ends.shape[0]
+    own = number >= augmented
 
     def codes(params):
         z_static, z_dynamic = window_codes(network, params, track, ends, spec.window, history)
@@ -183,6 +192,9 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         if not augmented:
             return z_static + z_dynamic
         # Motion augmentation: another window's dynamic code on this one's static code, both constants.
+        if axis is not None:  # any number of this device's windows are such, and the others' codes may be elsewhere
+            everyone = lax.all_gather(lax.stop_gradient(z_dynamic), axis, axis=1, tiled=True)
+            return jnp.where(own[:, None], z_static + z_dynamic, lax.stop_gradient(z_static) + everyone[:, pairs])
         swapped = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
         return jnp.concatenate([swapped, (z_static + z_dynamic)[:, augmented:]], axis=1)
 
@@ -197,21 +209,33 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         offsets += [earlier[:, :, 1], earlier[:, :, 0]]
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
-    share = (jnp.arange(ends.shape[0]) >= augmented).astype(last.dtype)
     weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
     body = None if known is None else jnp.moveaxis(known[ends], 0, -1)
-    parts, g, to_weights = physics(model, weights, offsets, matrices, share, body)
+    parts, g, to_weights = physics(model, weights, offsets, matrices, own.astype(last.dtype), body)
     (result,) = transpose(g / ends.shape[0])
     if network.learn_weights:
         (more,) = pull(jax.tree.map(lambda w: w / ends.shape[0], to_weights))
         result = jax.tree.map(jnp.add, result, more)
-    return result, parts, (g, offsets)
+    return result if axis is None else lax.pmean(result, axis), parts, (g, offsets)
 
 
-def step(model, network, spec, steps, state: TrainState, track, known, ends, pairs) -> tuple[TrainState, dict]:
-    """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted."""
-    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, known)
+def _sample(share, index, axis: str | None):
+    """Entry `index` of the whole batch, along the last axis, which within a `shard_map` over `axis` one device has."""
+    if axis is None:
+        return share[..., index]
+    size = share.shape[-1]
+    return lax.psum(jnp.where(lax.axis_index(axis) == index // size, share[..., index % size], 0), axis)
+
+
+def step(model, network, spec, steps, state: TrainState, track, known, ends, pairs, axis=None) -> tuple[TrainState, dict]:
+    """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted.
+
+    Within a `shard_map` over `axis`, `ends` and `pairs` are this device's share of the batch and the rest is every device's.
+    """
+    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, known, axis)
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
+    if axis is not None:
+        sample_good = lax.all_gather(sample_good, axis, tiled=True)
     # Columns first, which adds in vector lanes; a sum is finite only if everything in it is.
     sums = [jnp.sum(jnp.sum(leaf, axis=0)) for leaf in jax.tree.leaves(grads)]
     good = lax.optimization_barrier(jnp.all(sample_good) & jnp.isfinite(sum(sums)))
@@ -228,32 +252,39 @@ def step(model, network, spec, steps, state: TrainState, track, known, ends, pai
 
     def first_bad():
         worst = jnp.argmin(sample_good)
-        kept = state.fault.offsets.at[: len(offsets)].set(jnp.stack([frame[..., worst] for frame in offsets]))
-        return Fault(state.step, ends[worst], kept)
+        kept = state.fault.offsets.at[: len(offsets)].set(jnp.stack([_sample(frame, worst, axis) for frame in offsets]))
+        return Fault(state.step, _sample(ends, worst, axis), kept)
 
     fault = lax.cond(good, lambda: state.fault, first_bad)
     logs = {name: jnp.mean(value) for name, value in parts.items()}
+    logs = logs if axis is None else lax.pmean(logs, axis)
     return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
 
 
-def chunk_runner(network: NCS, spec: TrainingSpec):
+def chunk_runner(network: NCS, spec: TrainingSpec, mesh: Mesh | None = None):
     """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
 
     `steps` is how many the whole training has, for the schedule. The state's buffers are reused. Where the chunk sees frames
-    more than once, the body is posed once for all its steps.
+    more than once, the body is posed once for all its steps. With a mesh of several devices (`devices.batch_mesh`), each works
+    on its part of the batch and takes the same step as the others.
     """
 
-    @functools.partial(jax.jit, donate_argnums=0)
+    axis = None if mesh is None else mesh.axis_names[0]
+
     def run(state, ends, pairs, steps, model, track):
         repeated = model.terms.collision == "plane" and len(track.start) < ends.size
         known = posed_bodies(model, track.matrices, spec.batch) if repeated else None
 
         def body(state, indices):
-            return step(model, network, spec, steps, state, track, known, *indices)
+            return step(model, network, spec, steps, state, track, known, *indices, axis)
 
         return lax.scan(body, state, (ends, pairs))
 
-    return run
+    if mesh is not None:
+        whole, share = P(), P(None, axis)
+        given = whole, share, share, whole, whole, whole
+        run = jax.shard_map(run, mesh=mesh, in_specs=given, out_specs=whole, check_vma=False)
+    return jax.jit(run, donate_argnums=0)
 
 
 def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:
