@@ -215,6 +215,7 @@ def test_a_real_process_exits_with_2(tmp_path):
         (["animate", "nowhere", "--out", "a.npz"], ["nowhere", "run"]),
         (["evaluate", "nowhere"], ["nowhere"]),
         (["train", "ncs:tshirt", "--out", "nowhere", "--resume"], ["nowhere", "--resume"]),
+        (["train", "ncs:tshirt", "--out", "nowhere", "--resume", "--preset", "fast"], ["--preset", "'fast'", "leave it out"]),
     ],
 )
 def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, words):

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from benchmarks import simulator, training
-from experiments import fit_material, seeds
+from experiments import fit_material, seeds, speed_accuracy
 
 from .scenes import write_scene
 
@@ -56,3 +56,16 @@ def test_benchmark_of_the_simulator(tmp_path, capsys):
     assert rows["newton"]["seconds"]["min"] > 0 and rows["quasi_newton"]["iterations"]["max"] <= 9
     assert "quasi_newton" in capsys.readouterr().out
     assert simulator.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+def test_speed_accuracy(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert speed_accuracy.main([str(write_scene(tmp_path)), "--quick", "--only", "fast", "--out", str(out)]) == 0
+    with (out / "speed_accuracy.csv").open() as file:
+        rows = {row["point"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"simulation", "fast", "fast, rank 16", "fast, bfloat16"}
+    assert float(rows["simulation"]["excess"]) == 0 < float(rows["fast"]["excess"]) and float(rows["fast"]["frame"]) > 0
+    assert float(rows["fast, rank 16"]["distance"]) > 0 and float(rows["fast"]["memory"]) > 50
+    assert (out / "speed_accuracy.md").read_text().count("\n") == 2 + len(rows)
+    assert (out / "speed_accuracy.png").read_bytes()[:4] == b"\x89PNG"
+    assert speed_accuracy.main([str(tmp_path / "nowhere.toml")]) == 2

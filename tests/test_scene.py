@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from ncs_jax.errors import InputError
-from ncs_jax.scene import Scene, load_scene, scene_from, template
+from ncs_jax.scene import PRESETS, Scene, load_scene, scene_from, template
 
 
 def write(folder, text):
@@ -35,6 +35,16 @@ def _lists(value):
     if isinstance(value, dict):
         return {k: _lists(v) for k, v in value.items()}
     return list(value) if isinstance(value, tuple) else value
+
+
+def test_a_preset_takes_the_place_of_the_scenes_own_values(tmp_path):
+    path = write(tmp_path, "[network]\ndecoder = [7]\nmodes = 3\njoint = [9]\n[training]\nbatch = 5\n")
+    for name, tables in PRESETS.items():
+        scene = load_scene(path, name)
+        assert scene.network.decoder == tables["network"]["decoder"] and scene.training.batch == 5
+    assert load_scene(path).network.decoder == (7,)
+    sizes = [sum(PRESETS[name]["network"]["decoder"]) for name in ("fast", "balanced", "accurate")]
+    assert sizes == sorted(set(sizes))
 
 
 def test_relative_paths_resolve_from_the_file(tmp_path):

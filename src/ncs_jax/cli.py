@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from ncs_jax.errors import InputError
+from ncs_jax.scene import PRESETS, load_scene
 
 __all__ = ["main"]
 
@@ -65,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--steps", type=_whole, help="optimiser steps (default: the scene's)")
     train.add_argument("--minutes", type=_positive, help="train for about this long instead of a number of steps")
     train.add_argument("--seed", type=_seed, help="seed (default: the scene's)")
+    train.add_argument("--preset", choices=PRESETS, help="speed for accuracy: sizes of the network (default: the scene's)")
     train.add_argument("--resume", action="store_true", help="go on with the run in --out from its last checkpoint")
     train.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
     train.add_argument(
@@ -189,10 +191,13 @@ def _leave(code: int) -> None:
 def _train(options) -> int:
     import jax
 
+    if options.preset and options.resume:
+        raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
+    scene = load_scene(options.scene, options.preset)
     if options.hosts is not None:
         _join(options.hosts)
     try:
-        run = _trained(options.scene, options.out, options.steps, options.minutes, options.seed, options.resume)
+        run = _trained(scene, options.out, options.steps, options.minutes, options.seed, options.resume)
     except jax.errors.JaxRuntimeError as error:
         if options.hosts is None:
             raise
@@ -347,7 +352,6 @@ def _evaluate(options) -> int:
     from ncs_jax.assembly import assemble
     from ncs_jax.evaluation import QUANTITIES, measure, summarise
     from ncs_jax.runs import Run, load_run
-    from ncs_jax.scene import load_scene
 
     target = Path(options.target)
     if not target.exists():
@@ -392,7 +396,7 @@ def _evaluate(options) -> int:
 
 def _check(options) -> int:
     from ncs_jax.assembly import assemble
-    from ncs_jax.scene import load_scene, template
+    from ncs_jax.scene import template
 
     if options.fields:
         print(template(), end="")

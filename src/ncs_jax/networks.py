@@ -19,7 +19,7 @@ __all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge", "recurrence"]
 class StaticEncoder(nn.Module):
     """z_S from the static descriptors of one frame: a multilayer perceptron."""
 
-    sizes: Sequence[int] = (64, 128, 256, 512)
+    sizes: Sequence[int] = (64, 128, 256)
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
@@ -107,8 +107,8 @@ class DynamicEncoder(nn.Module):
     """
 
     joint_sizes: Sequence[int] = (32, 32)
-    sizes: Sequence[int] = (512, 512)
-    state: int = 512
+    sizes: Sequence[int] = (256, 256)
+    state: int = 256
     dtype: DTypeLike = jnp.float32
 
     def setup(self):
@@ -195,7 +195,7 @@ class Decoder(nn.Module):
     """
 
     verts: int
-    sizes: Sequence[int] = (512, 512, 512)
+    sizes: Sequence[int] = (256, 256, 256)
     modes: int = 128
     local: float = 0.005
     dtype: DTypeLike = jnp.float32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,8 +38,8 @@ class State:
 class Rollout(NamedTuple):
     """`init() -> state`; `step(state, rotations, translation, alpha) -> (state, vertices)`."""
 
-    init: object
-    step: object
+    init: Callable[[], State]
+    step: Callable[..., tuple[State, Array]]
 
 
 def stepper(model: Model, network: NCS, params: dict) -> Rollout:

@@ -16,6 +16,7 @@ from typing import Any
 from ncs_jax.errors import InputError
 
 __all__ = [
+    "PRESETS",
     "BendingSpec",
     "BodySpec",
     "CollisionSpec",
@@ -142,10 +143,10 @@ class NetworkSpec:
     """[network]: sizes of the networks."""
 
     descriptor: str = _f("heading_free", "pose descriptor", choices=("heading_free", "six", "quaternion", "axis_angle"))
-    static: tuple[int, ...] = _f((64, 128, 256, 512), "static encoder", low=1, high=65536)
+    static: tuple[int, ...] = _f((64, 128, 256), "static encoder", low=1, high=65536)
     joint: tuple[int, ...] = _f((32, 32), "dynamic encoder, each joint by itself", low=1, high=65536)
-    dynamic: tuple[int, ...] = _f((512, 512), "dynamic encoder, all joints", low=1, high=65536)
-    decoder: tuple[int, ...] = _f((512, 512, 512), "decoder", low=1, high=65536)
+    dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints", low=1, high=65536)
+    decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
     modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
 
 
@@ -209,6 +210,13 @@ class Scene:
         return tables
 
 
+PRESETS: dict[str, dict] = {
+    "fast": {"network": {"static": (64, 128, 128), "dynamic": (128, 128), "decoder": (128, 128, 128), "modes": 64}},
+    "balanced": {"network": dataclasses.asdict(NetworkSpec())},
+    "accurate": {"network": {"static": (64, 128, 256, 512), "dynamic": (512, 512), "decoder": (512, 512, 512), "modes": 128}},
+}  # what `ncs train --preset` puts in place of a scene's own values; experiments/speed_accuracy.py measures them
+
+
 def packaged(name: str, suffix: str = ".npz") -> Path:
     """A file that comes with the package."""
     path = ASSETS / f"{name}{suffix}"
@@ -218,8 +226,11 @@ def packaged(name: str, suffix: str = ".npz") -> Path:
     return path
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     """Read and check a scene file; `ncs:NAME` names a packaged scene.
+
+    Args:
+        path: the file. preset: one of PRESETS, whose values take the place of the scene's own.
 
     Raises:
         InputError: the file is missing or not TOML, a key is unknown, or a value has the wrong type or is out of its range.
@@ -234,6 +245,8 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", file=file, mend="mend that line") from None
+    for table, values in PRESETS[preset].items() if preset else ():
+        tables[table] = {**tables.get(table, {}), **values}
     return scene_from(tables, source=str(file))
 
 

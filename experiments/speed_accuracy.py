@@ -1,0 +1,242 @@
+"""What does accuracy cost? Networks, smaller decoders, contact queries, meshes and simulations of one garment on one curve.
+
+    python -m experiments.speed_accuracy ncs:tshirt --minutes 4 --out runs/speed_accuracy
+
+Every network is trained for the same time, every point in a process of its own, and judged on one motion (the scene's first
+validation motion, else its first) against the simulation of its own garment: mean total energy above the simulation's in %,
+strain and penetration in %, millimetres to it, ms of a streamed frame, frames/s of the whole motion, peak memory in MB of the
+training or the simulation. Writes speed_accuracy.csv, .md and .png. `--quick` is for trying it out: its numbers mean nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax import InputError, Scene, load_scene, measure, scene_from, simulate, summarise, train
+from ncs_jax.scene import PRESETS
+
+COLUMNS = {
+    "point": "",
+    "excess": "energy above simulation, %",
+    "strain_mean": "strain, %",
+    "penetrating": "penetrating, %",
+    "distance": "mm to simulation",
+    "frame": "ms a frame",
+    "rate": "frames/s, whole motion",
+    "minutes": "training, min",
+    "memory": "peak, MB",
+}
+# Of every preset's decoder.
+SMALLER: dict[str, dict] = {
+    "rank 64": {"rank": 64},
+    "rank 16": {"rank": 16},
+    "bfloat16": {"bfloat16": True},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One scene to train or to simulate."""
+
+    name: str
+    scene: Scene
+    simulated: bool = False
+
+
+def points(scene: Scene, finer: str | None) -> list[Point]:
+    """The points of the curve; those of a finer garment file, where there is one, come with its own simulation."""
+
+    def changed(**tables):
+        new = scene.to_dict()
+        for table, values in tables.items():
+            new[table] = {**new[table], **values}
+        return scene_from(new, source=scene.source)
+
+    def contact(**values):
+        physics = scene.to_dict()["physics"]
+        return changed(physics={**physics, "collision": {**physics["collision"], **values}})
+
+    result = [
+        Point("simulation", scene, True),
+        Point("simulation, tolerance 1 g", changed(simulation={"tolerance": 1.0}), True),
+        Point("simulation, 2 substeps", changed(simulation={"substeps": 2}), True),
+        Point("simulation, quasi-Newton", changed(simulation={"solver": "quasi_newton"}), True),
+    ]
+    result += [Point(name, changed(**tables)) for name, tables in PRESETS.items()]
+    result += [Point("contact by triangles", contact(distance="triangle"))]
+    result += [Point("contact by candidates", contact(search="candidates"))]
+    if finer is not None:
+        fine = changed(garment={"file": finer})
+        result += [Point("simulation, finer mesh", fine, True), Point("finer mesh", fine)]
+    return result
+
+
+def motion_of(scene: Scene) -> str:
+    """The motion that everything is judged on."""
+    return (*scene.motion.validation, *scene.motion.files)[0]
+
+
+def peak() -> float:
+    """Most memory this process has had, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 if sys.platform == "linux" else 1024) / 1e3 * 1.024
+
+
+def trained(point: Point, minutes: float | None, steps: int | None) -> list[dict]:
+    """Train a network and measure it, as it is and made smaller: rows with the vertices under "vertices"."""
+    began = time.monotonic()
+    run = train(point.scene, minutes=minutes, steps=steps)
+    taken, memory = (time.monotonic() - began) / 60, peak()
+    name = motion_of(point.scene)
+    rows = []
+    track = run.track(name)
+    variants: dict[str, dict] = {"": {}, **(SMALLER if point.name in PRESETS else {})}
+    for label, options in variants.items():
+        if options.get("rank", 0) > min(len(track.start), point.scene.network.decoder[-1]):
+            continue  # the motion or the decoder has not so many
+        small = run.compressed(name, **options) if options else run
+        x = small.animate(track)
+        row = {"point": f"{point.name}, {label}" if label else point.name, "minutes": taken, "memory": memory, "vertices": x}
+        row |= summarise(measure(run.assembly.model, x, track))
+        row["frame"] = 1e3 * streamed(small, name)
+        row["rate"] = len(x) / median(lambda small=small, track=track: small.animate(track))
+        rows.append(row)
+    return rows
+
+
+def simulated(point: Point) -> list[dict]:
+    """Simulate and measure."""
+    name = motion_of(point.scene)
+    result = simulate(point.scene, name)
+    # Judged by the same energies at the same frame rate as the networks, whatever its own substeps.
+    lone = dataclasses.replace(result.assembly.scene.motion, fps=point.scene.motion.fps)
+    from ncs_jax.assembly import assemble, load_motion, track_of
+
+    assembly = assemble(dataclasses.replace(result.assembly.scene, motion=lone))
+    track = track_of(assembly.model, load_motion(assembly.scene, name, assembly.body))
+    row = {"point": point.name, "frame": 1e3 * float(np.median(result.seconds[1:])), "memory": peak()}
+    row |= {"vertices": result.vertices, **summarise(measure(assembly.model, result.vertices, track))}
+    return [row]
+
+
+def median(call, repeats: int = 7) -> float:
+    """Median time of a call in s, the first one left out."""
+    call()
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
+
+
+def streamed(run, motion: str) -> float:
+    """Median time in s of one frame of a stream with carried state, over the motion."""
+    import jax
+    import jax.numpy as jnp
+
+    from ncs_jax import local_rotations, stepper
+
+    model, record = run.assembly.model, run.motion(motion)
+    rollout = stepper(model, run.assembly.network, run.params)
+    local, way = local_rotations(model, jnp.asarray(record.poses)), jnp.asarray(record.translation)
+    step = jax.jit(rollout.step, donate_argnums=0)
+    state, times = rollout.init(), []
+    for t in range(len(local)):
+        frame = jax.block_until_ready((local[t], way[t]))
+        began = time.perf_counter()
+        state, _ = jax.block_until_ready(step(state, *frame))
+        times.append(time.perf_counter() - began)
+    return float(np.median(times[1:]))
+
+
+def experiment(
+    scene: Scene, out: Path, *, finer=None, minutes: float | None = 4.0, steps: int | None = None, only: Sequence[str] = ()
+) -> list[dict]:
+    """Measure every point, write the tables and the picture into `out`, and return the rows."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict] = []
+    spawn = multiprocessing.get_context("spawn")
+    references: dict[str, dict] = {}  # by garment file
+    wanted = [point for point in points(scene, finer) if not only or point.name in ("simulation", *only)]
+    for point in wanted:
+        job = (simulated, point) if point.simulated else (trained, point, minutes, steps)
+        with ProcessPoolExecutor(1, mp_context=spawn) as alone:
+            found = alone.submit(*job).result()
+        reference = references.setdefault(point.scene.garment.file, found[0])
+        for row in found:
+            row["excess"] = 100 * (row["total"] / reference["total"] - 1)
+            row["distance"] = 1e3 * float(np.linalg.norm(row["vertices"] - reference["vertices"], axis=-1).mean())
+            print("  ".join(f"{k} {row[k]:.4g}" if k != "point" else f"{row[k]:28}" for k in COLUMNS if k in row), flush=True)
+        rows += found
+        write(out, [{k: row.get(k, "") for k in (*COLUMNS, "total")} for row in rows])
+    draw(out / "speed_accuracy.png", rows)
+    return rows
+
+
+def write(out: Path, rows: list[dict]) -> None:
+    """The rows as CSV and as a Markdown table."""
+    with (out / "speed_accuracy.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0])
+        table.writeheader()
+        table.writerows(rows)
+    lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
+    lines += ["| " + " | ".join(v if isinstance(v := row[k], str) else f"{v:.3g}" for k in COLUMNS) + " |" for row in rows]
+    (out / "speed_accuracy.md").write_text("\n".join(lines) + "\n")
+
+
+def draw(path: Path, rows: list[dict]) -> None:
+    """Distance to the simulation and excess energy over the time of a frame; what nothing else beats is joined by a line."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.5), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, key in zip(figure.subplots(1, 2), ("excess", "distance"), strict=True):
+        shown = sorted((row for row in rows if row[key] > 0), key=lambda row: row["frame"])
+        best = [row for i, row in enumerate(shown) if all(row[key] < other[key] for other in shown[:i])]
+        axes.plot([row["frame"] for row in best], [row[key] for row in best], color="0.7", zorder=0)
+        for row in shown:
+            style = "s" if "simulation" in row["point"] else "o"
+            preset = row["point"] in PRESETS
+            axes.plot(row["frame"], row[key], style, color="C3" if preset else "C0", markersize=7 if preset else 4)
+            axes.annotate(row["point"], (row["frame"], row[key]), fontsize=6, xytext=(4, 3), textcoords="offset points")
+        axes.set(xscale="log", yscale="log", xlabel=COLUMNS["frame"], ylabel=COLUMNS[key])
+        axes.grid(alpha=0.3, which="both")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
+    parser.add_argument("--minutes", type=float, default=4.0, help="of training, for every network (default: 4)")
+    parser.add_argument("--finer", metavar="FILE", help="a finer mesh of the garment (default: the packaged one, where it is)")
+    parser.add_argument("--only", nargs="+", default=(), metavar="POINT", help="these points, beside the simulation")
+    parser.add_argument("--quick", action="store_true", help="20 steps of training")
+    parser.add_argument("--out", default="runs/speed_accuracy", help="folder for the tables and the picture")
+    options = parser.parse_args(arguments)
+    try:
+        scene = load_scene(options.scene)
+        finer = options.finer or (f"{scene.garment.file}_fine" if scene.garment.file.startswith("ncs:") else None)
+        length = {"steps": 20, "minutes": None} if options.quick else {"minutes": options.minutes}
+        experiment(scene, Path(options.out), finer=finer, only=options.only, **length)
+    except InputError as error:
+        print(f"speed_accuracy: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
