@@ -5,7 +5,7 @@ CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" 
 INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
 	$(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS))
 
-.PHONY: demo test test-all lint format assets clean
+.PHONY: demo test test-all bench lint format assets clean
 
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
@@ -18,6 +18,12 @@ test: .venv/ready
 
 test-all: .venv/ready
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not gpu"
+
+# Every benchmark on its packaged scene, or on SCENE: tables on the screen, figures in runs/bench. About a quarter of an hour.
+BENCHMARKS = training inference quality simulator growth
+bench: .venv/installed
+	mkdir -p runs/bench
+	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name $(SCENE) --json runs/bench/$$name.json || exit; done
 
 lint: .venv/ready
 	$(BIN)/ruff check .

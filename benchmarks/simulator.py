@@ -1,18 +1,15 @@
 """What a simulated frame costs with both solvers, how well it is solved, and how the time grows with the garment.
 
-    python -m benchmarks.simulator [SCENE] [--frames N] [--iterations N] [--growth] [--json FILE]
+    python -m benchmarks.simulator [SCENE] [--frames 30] [--iterations 9] [--growth] [--quick] [--json FILE]
 
-Newton solves every frame to 0.1 g; quasi-Newton stops after a fixed number of iterations, 9, and says
-what is left. Seconds a frame are those of a stream, compile time and the first, static, frame apart. `--growth` instead divides
-every triangle of the scene's garment in four, and again, and measures one iteration of both.
+Newton solves every frame to 0.1 g; quasi-Newton stops after a fixed number of iterations, 9, and says what is left. Seconds a
+frame are those of a stream, compile time and the first, static, frame apart. `--growth` instead divides every triangle of the
+scene's garment in four, and again, and measures so many iterations of both. The least is that of the median number of
+iterations: of one sparse factor each for Newton and one a frame for quasi-Newton, and of reading it twice to solve with it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import sys
 import tempfile
 import time
@@ -23,16 +20,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ncs_jax import InputError, assemble, load_scene
+from benchmarks import work
+from benchmarks.growth import finer
+from benchmarks.measure import Work, clock, read, run, table
+from ncs_jax import assemble
 from ncs_jax.assembly import Assembly
-from ncs_jax.io.npz import write_npz
-from ncs_jax.scene import Scene
 from ncs_jax.simulator import simulator_from, stepper
 from ncs_jax.solver.minimise import CONVERGED, Settings
 
-HERE = Path(__file__).parent
-FAST = Settings("quasi_newton", tolerance=1.0, iterations=9)
-TWICE = (1, 4, 16)  # times as many triangles
+FAST = Settings("quasi_newton", tolerance=1.0)
+TIMES = (1, 4, 16)  # as many triangles
 
 
 def stream(assembly: Assembly, settings: Settings, frames: int) -> dict:
@@ -58,95 +55,57 @@ def stream(assembly: Assembly, settings: Settings, frames: int) -> dict:
         rows.append((time.perf_counter() - start, int(s.iterations), float(s.residual), int(s.status)))
     first, rest = rows[0], np.array(rows[1:])
     seconds, iterations, residual, status = rest.T
+    typical, newton = float(np.median(iterations)), settings.solver == "newton"
+    factor, solve = work.factor(simulator.order, 3 if newton else 1, assembly.model.garment.mesh.rest.dtype.itemsize)
+    factors = typical if newton else 1
     return {
-        "compile": compiled,
         "first": first[0],
-        "seconds": {
-            "min": seconds.min(),
-            "median": np.median(seconds),
-            "p90": np.percentile(seconds, 90),
-            "max": seconds.max(),
-        },
+        "seconds": clock(seconds, compiled) | {"p90": float(np.percentile(seconds, 90))},
         "each": float(np.median(seconds / np.maximum(iterations, 1))),
-        "iterations": {"median": np.median(iterations), "max": iterations.max()},
-        "residual": {"median": np.median(residual), "max": residual.max()},
+        "iterations": {"median": typical, "max": float(iterations.max())},
+        "residual": {"median": float(np.median(residual)), "max": float(residual.max())},
         "unsolved": int(np.sum(status != CONVERGED)),
         "frames": frames,
-        "vertices": len(assembly.model.garment.mesh.rest),
+        "work": Work(factors * factor.flops + typical * solve.flops, factors * factor.bytes + typical * solve.bytes),
     }
 
 
-def finer(scene: Scene, times: int, folder: Path) -> Scene:
-    """The scene with every triangle of its garment divided into `times`, a power of four."""
-    from trimesh.remesh import subdivide
+def benchmark(options) -> dict:
+    """Measure both solvers on a scene, or some iterations of each on ever finer garments; `quick`: quasi-Newton alone."""
+    spec, rows, iterations = read(options.scene), {}, options.iterations
+    frames = 3 if options.quick else max(options.frames, 2)
+    solvers = [replace(FAST, iterations=iterations)] if options.quick else [Settings(), replace(FAST, iterations=iterations)]
+    with tempfile.TemporaryDirectory() as folder:
+        for times in TIMES if options.growth and not options.quick else TIMES[:1]:
+            finest = finer(spec, Path(folder), garment=times)
+            assembly = assemble(replace(finest, network=replace(finest.network, modes=0)))
+            for settings in solvers:
+                if options.growth:
+                    settings = Settings(settings.solver, tolerance=1e-9, iterations=iterations, first=iterations)
+                row = stream(assembly, settings, frames)
+                rows[f"{settings.solver}, {len(assembly.model.garment.mesh.rest)} vertices"] = row
+    return {"rows": rows}
 
-    mesh = assemble(scene).model.garment.mesh
-    vertices, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
-    while times > 1:
-        vertices, faces = subdivide(vertices, faces)
-        times //= 4
-    path = folder / f"garment{len(vertices)}.npz"
-    write_npz(path, vertices=vertices, faces=faces.astype(np.int32))
-    return replace(scene, garment=replace(scene.garment, file=str(path), pins=""), network=replace(scene.network, modes=0))
 
-
-def benchmark(scene: str | Path = HERE / "tshirt.toml", frames: int = 30, iterations: int = 9, growth: bool = False) -> dict:
-    """Measure both solvers on a scene, or an iteration of each on ever finer garments."""
-    spec = load_scene(scene)
-    rows = {}
-    if growth:
-        with tempfile.TemporaryDirectory() as folder:
-            for times in TWICE:
-                assembly = assemble(finer(spec, times, Path(folder)))
-                for name in ("newton", "quasi_newton"):
-                    few = Settings(name, tolerance=1e-9, iterations=iterations, first=iterations)
-                    row = stream(assembly, few, frames)
-                    rows[f"{name}, {row['vertices']} vertices"] = row
-    else:
-        assembly = assemble(spec)
-        rows["newton"] = stream(assembly, Settings(), frames)
-        rows["quasi_newton"] = stream(assembly, replace(FAST, iterations=iterations), frames)
-    return {
-        "scene": str(scene),
-        "rows": rows,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
-        "versions": {"python": platform.python_version(), "jax": jax.__version__},
-        "device": jax.devices()[0].platform,
-    }
+def show(figures: dict) -> str:
+    """The table."""
+    heads = ["s a frame, residual in g", "compile", "min", "median", "p90", "max", "least", "% of limit"]
+    heads += ["iterations", "each", "residual", "worst", "unsolved"]
+    lines = []
+    for name, row in figures["rows"].items():
+        times = [row["seconds"][k] for k in ("compile", "min", "median", "p90", "max")]
+        solved = [row["iterations"]["median"], row["each"], *row["residual"].values()]
+        lines.append([name, *times, row["least"], 100 * row["share"], *solved, f"{row['unsolved']} of {row['frames'] - 1}"])
+    return table(heads, lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", nargs="?", default=HERE / "tshirt.toml", help="scene file (default: benchmarks/tshirt.toml)")
-    parser.add_argument("--frames", type=int, default=30, help="frames of the scene's first motion (default: 30)")
-    parser.add_argument("--iterations", type=int, default=9, help="of quasi-Newton; with --growth of both (default: 9)")
-    parser.add_argument("--growth", action="store_true", help="one iteration on ever finer garments")
-    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
-    options = parser.parse_args(arguments)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `ncs simulate` does
-    try:
-        result = benchmark(options.scene, max(options.frames, 2), options.iterations, options.growth)
-    except InputError as error:
-        print(f"simulator: {error}", file=sys.stderr)
-        return 2
-    print(f"{result['scene']}, {result['machine']['cores']} cores, {result['device']}; seconds a frame, residual in g")
-    heads = ("compile", "min", "median", "p90", "max", "iterations", "an iteration", "residual", "worst", "unsolved")
-    print(f"{'':32}" + " ".join(f"{head:>12}" for head in heads))
-    for name, row in result["rows"].items():
-        figures = (
-            row["compile"],
-            *row["seconds"].values(),
-            row["iterations"]["median"],
-            row["each"],
-            *row["residual"].values(),
-        )
-        print(
-            f"{name:32}" + " ".join(f"{figure:12.3f}" for figure in figures) + f" {row['unsolved']:>5} of {row['frames'] - 1}"
-        )
-    if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=2, default=float) + "\n")
-    return 0
+    return run(
+        __doc__, benchmark, show, arguments, scene=str(Path(__file__).parent / "tshirt.toml"),
+        frames=(30, "of the scene's first motion, its first too"), iterations=(9, "of quasi-Newton; with --growth of both"),
+        growth=(False, "some iterations on ever finer garments"),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -1,115 +1,208 @@
-"""What a training step costs on a scene, compile time apart.
+"""What a training step costs on a scene, part by part, beside the least that it could cost on this machine.
 
-    python -m benchmarks.training [SCENE] [--repeats 7] [--json FILE]
+    python -m benchmarks.training [SCENE] [--repeats 7] [--quick] [--json FILE]
 
-Prints, for each part, the seconds it takes to compile, and the minimum, median and maximum of the repeats once it is
-compiled. `yardstick` is the time of the step's own matrix products alone, the least a step could take on this machine.
+Every part is timed inside one compiled loop, as it stands in the scan of a training, on the poses of one batch after some steps
+of training: its value and its derivative, for all poses of the batch. Indented rows are parts of the row above them;
+`descriptors` are computed once a scene and are no part of a step. The least is the time of the matrix products and of the bytes
+that a part cannot avoid (`benchmarks/work.py`), at the rates that this run measures; other arithmetic is not counted, so an
+energy's least is that of reading positions and writing forces.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
+import functools
 import sys
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from dataclasses import replace
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from ncs_jax import InputError, assemble, load_scene
-from ncs_jax.rollout import animate
-from ncs_jax.training import CHUNK, batches, chunk_runner, gradients, initial_state
+from benchmarks import work
+from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_memory, read, run, timed
+from ncs_jax import assemble, local_rotations, training
+from ncs_jax.assembly import Assembly
+from ncs_jax.kinematics import blend, skin
+from ncs_jax.methods.ncs import garment_blend
+from ncs_jax.model import Model, pose_body
+from ncs_jax.motion import track
+from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
 
-
-def timed(work: Callable, repeats: int, count: int = 1) -> dict[str, float]:
-    """Seconds of the first call less a typical one, and of `repeats` further ones, each divided by `count`."""
-    start = time.perf_counter()
-    jax.block_until_ready(work())
-    first = time.perf_counter() - start
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(work())
-        seconds.append((time.perf_counter() - start) / count)
-    compile_seconds = max(0.0, first - count * float(np.median(seconds)))
-    return {"compile": compile_seconds, "min": min(seconds), "median": float(np.median(seconds)), "max": max(seconds)}
+STEPS = 1000  # of the schedule
+NOTHING = Terms(None, bending=False, collision=None, gravity=False, inertia=False)
+DEPTH = {"step": 0, "descriptors": 0, "network": 1, "physics": 1, "optimiser": 1, "contact query": 3}  # all others 2
 
 
-def products(params: dict, batch: int, window: int) -> Callable:
-    """The matrix products that a step cannot avoid: forward and backward of every kernel, over the frames it is applied to."""
-    jobs = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if leaf.ndim == 2:
-            frames = batch * (window if "dynamic" in jax.tree_util.keystr(path) else 1)
-            jobs.append((jnp.ones((frames, leaf.shape[0]), leaf.dtype), leaf, jnp.ones((frames, leaf.shape[1]), leaf.dtype)))
+def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:
+    """`count` training steps as one program, and a list of one: the state, which goes on from call to call."""
+    model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
+    chunk, held = training.chunk_runner(network, spec), [training.initial_state(model, network, 0)]
+    ends, pairs = batch(assembly, count)
 
-    @jax.jit
-    def run(jobs):
-        return [(x @ w, g @ w.T, x.T @ g) for x, w, g in jobs]
-
-    return lambda: run(jobs)
-
-
-def benchmark(scene: str | Path = "ncs:tshirt", repeats: int = 7) -> dict:
-    """Measure a scene's training step and its whole-sequence inference."""
-    assembly = assemble(load_scene(scene))
-    model, network, track, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
-    frames = track.start.shape[0]
-    ends = jnp.asarray(batches(frames, spec.batch, 0, 0, CHUNK))
-    pairs = jnp.zeros_like(ends)
-    state = initial_state(model, network, 0)
-    gradient = jax.jit(lambda model, params, track, ends, pairs: gradients(model, network, spec, params, track, ends, pairs)[0])
-    parts = {"gradient": timed(lambda: gradient(model, state.params, track, ends[0], pairs[0]), repeats)}
-    parts["yardstick"] = timed(products(state.params, spec.batch, spec.window), repeats)
-    sequence = jax.jit(animate, static_argnums=1)
-    parts["animate, a frame"] = timed(lambda: sequence(model, network, state.params, track), repeats, frames)
-    run, held = chunk_runner(network, spec), [state]
-
-    def chunk():
-        held[0], logs = run(held[0], ends, pairs, 1000, model, track)
+    def several():
+        held[0], logs = chunk(held[0], ends, pairs, STEPS, model, whole)
         return logs
 
-    parts["step"] = timed(chunk, repeats, CHUNK)
-    return {
-        "scene": str(scene),
-        "vertices": model.garment.mesh.rest.shape[0],
-        "touchable body vertices": 0 if model.body is None else model.body.shape[0],
-        "batch": spec.batch,
-        "window": spec.window,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(held[0].params)),
-        "seconds": parts,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
-        "versions": {"python": platform.python_version(), "jax": jax.__version__},
-        "device": jax.devices()[0].platform,
+    return several, held
+
+
+def batch(assembly: Assembly, count: int):
+    """Last frames of the windows of the first steps, and with whom each is paired: (count, batch) both."""
+    size = assembly.scene.training.batch
+    ends = training.batches(assembly.track.start.shape[0], size, 0, 0, count)
+    return jnp.asarray(ends), jnp.tile(jnp.arange(size, dtype=jnp.int32)[::-1], (count, 1))
+
+
+def _front(tree):
+    return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), tree)
+
+
+def _energy(model: Model, name: str) -> Callable:
+    """One term and its gradient by the positions, of poses at the back: a function of positions and what a frame brings."""
+    terms = replace(NOTHING, exact=model.terms.exact, **{name: getattr(model.terms, name)})
+
+    def of(varied, model):
+        def value(x, brought):
+            given = dict(brought)
+            if name == "friction":
+                near = replace(terms, collision=model.terms.collision)
+                given["pressed"] = pressure(given["carried"], given["body"], model.surface, near, model.material)
+            parts = energies(x, model.garment, model.material, Frame(1 / model.fps, **given), terms, model.surface)
+            return jnp.sum(parts[name])
+
+        return jax.value_and_grad(value)(*varied)
+
+    together = name in ("gravity", "inertia") or terms.collision == "plane"  # as in `training.physics`
+    return of if together else lambda varied, model: lax.map(lambda pose: of(pose, model), _front(varied))
+
+
+def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[str, tuple]:
+    """Every part that the scene has, by name: a function, what it depends on, and its constants."""
+    model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
+    terms, params = model.terms, state.params
+    offsets = jax.jit(lambda p: training.gradients(model, network, spec, p, whole, ends, pairs))(params)[2][1]
+    history = len(offsets)
+    back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], whole.start[ends][None])
+    matrices = jnp.moveaxis(whole.matrices[back], 1, -1)
+    weights = garment_blend(network, params, model)
+
+    def unmoved(model, weights, offsets, *_):
+        return {}, offsets[0], weights
+
+    def networks(whole, params, model):
+        with mock.patch.object(training, "physics", unmoved):
+            return training.gradients(model, network, spec, params, whole, ends, pairs)
+
+    def pose(offset, matrices, model):
+        return skin(blend(matrices, weights), model.garment.mesh.rest[:, :, None] + offset)
+
+    def skinned(varied, model):
+        offsets, matrices = varied
+        x, pull = jax.vjp(lambda offset: pose(offset, matrices[0], model), offsets[0])
+        return [x, *(pose(offsets[k], matrices[k], model) for k in range(1, history))], pull(jnp.ones_like(x))
+
+    posed = jax.jit(skinned)((offsets, matrices), model)[0]
+    x, share = posed[0], jnp.ones(len(ends), posed[0].dtype)
+    found: dict[str, tuple] = {
+        "network": (networks, whole, params, model),
+        "physics": (
+            lambda varied, model: training.physics(model, weights, varied[0], varied[1], share),
+            (offsets, matrices),
+            model,
+        ),
+        "skinning": (skinned, (offsets, matrices), model),
     }
+    brought: dict[str, dict] = {"inertia": {"previous": posed[1], "before": posed[2]}} if terms.inertia else {}
+    if model.body is not None:
+        body = jax.jit(pose_body)(model, matrices[0])
+        found["body"] = (lambda matrices, model: pose_body(model, matrices), matrices[0], model)
+        brought["collision"] = {"body": body}
+    for name in ("membrane", "bending"):
+        if value := getattr(terms, name):
+            alone = replace(NOTHING, **{name: value})
+            found[name] = (lambda x, model, alone=alone: elastic(x, model.garment, model.material, alone), x, model)
+    if terms.friction:
+        brought["friction"] = {"body": body, "carried": pose(offsets[1], matrices[0], model)}
+    if terms.pinning:
+        brought["pinning"] = {"blended": blend(matrices[0], weights)}
+    for name in ("collision", "friction", "gravity", "inertia", "pinning", "self_contact"):
+        if getattr(terms, name):
+            found[name] = (_energy(model, name), (x, brought.get(name, {})), model)
+
+    def queried(varied, model):
+        def one(varied):
+            return distances(*varied, model.surface, terms)
+
+        return one(varied) if terms.collision == "plane" else lax.map(one, _front(varied))
+
+    if terms.collision:
+        found["contact query"] = (queried, (x, body), model)
+    return found
+
+
+def optimiser(assembly: Assembly, state: training.TrainState, ends, pairs) -> tuple:
+    """All of a step but its gradient, which is taken as given: as a step of `advanced`, its carry, and its constants."""
+    model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
+    given = jax.eval_shape(lambda p: training.gradients(model, network, spec, p, whole, ends, pairs), state.params)
+    given = jax.tree.map(lambda s: jnp.full(s.shape, 1e-6, s.dtype), given)
+
+    def update(carry, model, whole):
+        state, given = carry
+        given = nudged(given, 1e-30 * state.step.astype(jnp.float32))
+        with mock.patch.object(training, "gradients", lambda *_: given):
+            state, _ = training.chunk_runner(network, spec)(state, ends[None], pairs[None], STEPS, model, whole)
+        return state, given
+
+    return update, (state, given), model, whole
+
+
+def benchmark(options) -> dict:
+    """Measure a scene's training step and its parts."""
+    assembly = assemble(read(options.scene))
+    model, whole = assembly.model, assembly.track
+    rounds, count = (2, 2) if options.quick else (ROUNDS, training.CHUNK)
+    several, held = steps(assembly, count)
+    seconds = {"step": timed(several, options.repeats, count)}
+    peak = peak_memory()
+    ends, pairs = (a[0] for a in batch(assembly, 1))
+    loop = functools.partial(looped, repeats=options.repeats, rounds=rounds)
+    seconds |= {name: loop(*part) for name, part in parts(assembly, held[0], ends, pairs).items()}
+    seconds["optimiser"] = advanced(*optimiser(assembly, held[0], ends, pairs), repeats=options.repeats, rounds=rounds)
+    records = [assembly.motions[name] for name in assembly.scene.motion.files]
+    poses, places = (jnp.asarray(np.concatenate([getattr(r, k) for r in records])) for k in ("poses", "translation"))
+    start = whole.start[: len(poses)]
+    described = (lambda poses, start, model: track(model, *poses, start), (local_rotations(model, poses), places), start, model)
+    seconds["descriptors"] = loop(*described)
+    needed = work.training(assembly, held[0].params, np.asarray(ends))
+    rows: dict[str, dict] = {name: {"seconds": seconds[name], "work": needed[name]} for name in needed if name in seconds}
+    rows["descriptors"]["times"] = len(whole.start) / len(poses)  # its mirror images were left out
+    return {
+        "vertices": len(model.garment.mesh.rest),
+        "touchable body vertices": 0 if model.body is None else len(model.body),
+        "batch": len(ends),
+        "window": assembly.scene.training.window,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(held[0].params)),
+        "peak memory MB": peak >> 20,
+        "rows": rows,
+    }
+
+
+def show(figures: dict) -> str:
+    """The table of a step's parts, and what they come to."""
+    rows = figures["rows"]
+    parts = sum(row["seconds"]["median"] for name, row in rows.items() if DEPTH.get(name) == 1)
+    indented = {"  " * DEPTH.get(name, 2) + name: row for name, row in rows.items()}
+    text = f"the parts of a step come to {1000 * parts:.4g} ms, the step takes {1000 * rows['step']['seconds']['median']:.4g}"
+    return f"{clocks(indented)}\n{text}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
-    parser.add_argument("--repeats", type=int, default=7, help="timed calls of each part (default: 7)")
-    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
-    options = parser.parse_args(arguments)
-    try:
-        result = benchmark(options.scene, options.repeats)
-    except InputError as error:
-        print(f"training: {error}", file=sys.stderr)
-        return 2
-    print(", ".join(f"{k} {v}" for k, v in result.items() if k not in ("seconds", "machine", "versions")))
-    print(f"{'ms':20} {'compile':>9} {'min':>9} {'median':>9} {'max':>9}")
-    for name, t in result["seconds"].items():
-        print(f"{name:20} " + " ".join(f"{1000 * t[k]:9.2f}" for k in ("compile", "min", "median", "max")))
-    step, least = result["seconds"]["step"]["median"], result["seconds"]["yardstick"]["median"]
-    print(f"the step's own matrix products are {100 * least / step:.0f} % of it")
-    if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=2) + "\n")
-    return 0
+    return run(__doc__, benchmark, show, arguments, repeats=(7, "timed calls of each part"))
 
 
 if __name__ == "__main__":

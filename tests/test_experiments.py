@@ -1,11 +1,9 @@
-"""Experiments and benchmarks at their smallest size."""
+"""Experiments at their smallest size."""
 
 import csv
-import json
 
 import pytest
 
-from benchmarks import simulator, training
 from experiments import fit_material, seeds, speed_accuracy
 
 from .scenes import write_scene
@@ -38,24 +36,6 @@ def test_fit_material(tmp_path, capsys):
     assert (tmp_path / "fit_material.png").read_bytes()[:4] == b"\x89PNG"
     assert "stretch 5.0000  bending 0.2000  density 5.0000" in capsys.readouterr().out
     assert fit_material.main(["--cloth", "tshirt", "--frames", "1000", "--out", str(tmp_path)]) == 2
-
-
-def test_training_benchmark(tmp_path, capsys):
-    assert training.main([str(write_scene(tmp_path)), "--repeats", "2", "--json", str(tmp_path / "t.json")]) == 0
-    result = json.loads((tmp_path / "t.json").read_text())
-    assert result["vertices"] == 30 and {"step", "gradient", "yardstick"} <= set(result["seconds"])
-    assert all(0 < t["min"] <= t["median"] <= t["max"] for t in result["seconds"].values())
-    assert "median" in capsys.readouterr().out
-
-
-@pytest.mark.slow  # nearly all of it is compiling
-def test_benchmark_of_the_simulator(tmp_path, capsys):
-    scene, out = write_scene(tmp_path), tmp_path / "figures.json"
-    assert simulator.main([str(scene), "--frames", "4", "--json", str(out)]) == 0
-    rows = json.loads(out.read_text())["rows"]
-    assert rows["newton"]["seconds"]["min"] > 0 and rows["quasi_newton"]["iterations"]["max"] <= 9
-    assert "quasi_newton" in capsys.readouterr().out
-    assert simulator.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
 def test_speed_accuracy(tmp_path, capsys):

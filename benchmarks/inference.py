@@ -1,0 +1,125 @@
+"""What a frame costs with a network: streamed, of a whole motion, of many characters at once, and with a smaller decoder.
+
+    python -m benchmarks.inference [SCENE] [--steps 100] [--rank 64] [--frames 500] [--repeats 7] [--quick] [--json FILE]
+
+SCENE is a scene file, which is trained for so many steps, or the folder of a run. A streamed frame is one call of the compiled
+step with its state's memory reused, waited for: its median and 99th percentile are over so many frames. `mm` is how far the
+vertices of the motion are from those of the whole decoder in float32, in the mean and at most; the rank is made for this
+motion, the scene's first. With many characters, who are at different places of the motion, times are a character's. The least
+is that of reading the parameters once and writing the vertices, or of the layers' products at the rate of float32; see
+`benchmarks/work.py`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import work
+from benchmarks.measure import clocks, peak_memory, read, run, timed
+from ncs_jax import Run, load_run, local_rotations, train
+from ncs_jax.methods.ncs import for_inference
+from ncs_jax.rollout import animate, stepper
+
+CHARACTERS = (1, 4, 16, 64, 256)
+PLACES = 64  # of the motion, that a crowd goes through
+
+
+def stream(garment: Run, characters: int | None = None) -> Callable:
+    """One frame of the first motion as one program, or one of each of several characters, at different places of it."""
+    model = garment.assembly.model
+    rollout: Any = stepper(model, garment.assembly.network, garment.params)
+    record = garment.motion(garment.assembly.scene.motion.files[0])
+    rotations, places = local_rotations(model, jnp.asarray(record.poses)), jnp.asarray(record.translation)
+    leaves, form = jax.tree.flatten(rollout.init())
+
+    def plain(leaves, rotations, place):  # of plain arrays: the state of several characters is no state of one
+        state, x = rollout.step(jax.tree.unflatten(form, leaves), rotations, place)
+        return jax.tree.leaves(state), x
+
+    if characters is not None:
+        frames = len(places)
+        at = (np.arange(min(frames, PLACES))[:, None] + np.arange(characters) * max(1, frames // characters)) % frames
+        rotations, places = rotations[at], places[at]
+        leaves = [jnp.stack([leaf] * characters) for leaf in leaves]
+    program = jax.jit(plain if characters is None else jax.vmap(plain), donate_argnums=0)
+    inputs, held, now = list(zip(list(rotations), list(places), strict=True)), leaves, 0
+
+    def frame():
+        nonlocal held, now
+        held, x = program(held, *inputs[now % len(inputs)])
+        now += 1
+        return x
+
+    return frame
+
+
+def sequence(garment: Run) -> tuple[Callable, int]:
+    """The first motion animated at once, and how many frames it has."""
+    model, network = garment.assembly.model, garment.assembly.network
+    program, track = jax.jit(animate, static_argnums=1), garment.track(garment.assembly.scene.motion.files[0])
+    network, params = for_inference(network, garment.params, model)
+    return lambda: program(model, network, params, track), len(track.start)
+
+
+def benchmark(options) -> dict:
+    """Measure a scene's inference."""
+    if Path(options.scene).is_dir():
+        whole = load_run(options.scene)
+        read(whole.assembly.scene)
+    else:
+        whole = train(read(options.scene), steps=min(options.steps, 10) if options.quick else options.steps)
+    model, motion = whole.assembly.model, whole.assembly.scene.motion.files[0]
+    frames = 5 if options.quick else options.frames
+    track = whole.track(motion)
+    rank = min(options.rank, len(track.start), *whole.assembly.network.decoder.sizes)
+    smaller = {"bfloat16": whole.compressed(track, bfloat16=True), f"rank {rank}": whole.compressed(track, rank=rank)}
+    smaller[f"rank {rank}, bfloat16"] = whole.compressed(track, rank=rank, bfloat16=True)
+    if options.quick:
+        smaller = dict(list(smaller.items())[-1:])
+    rows: dict[str, dict] = {}
+    exact = whole.animate(track)
+    for name, garment in {"float32": whole, **smaller}.items():
+        params = for_inference(garment.assembly.network, garment.params, model)[1]
+        apart = 1000 * np.linalg.norm(garment.animate(track) - exact, axis=-1)
+        error = {"mm mean": float(apart.mean()), "mm max": float(apart.max())}
+        several, count = sequence(garment)
+        rows[f"streamed, {name}"] = {
+            "seconds": timed(stream(garment), frames), "work": work.inference(model, params, 1), **error,
+        }  # fmt: skip
+        rows[f"whole motion, {name}, a frame"] = {
+            "seconds": timed(several, options.repeats, count), "work": work.inference(model, params, count), "times": count,
+            **error,
+        }  # fmt: skip
+    params = for_inference(whole.assembly.network, whole.params, model)[1]
+    for n in CHARACTERS[:2] if options.quick else CHARACTERS:
+        seconds = timed(stream(whole, n), max(options.repeats, frames // n), n)
+        rows[f"{n} at once, each"] = {"seconds": seconds, "work": work.inference(model, params, n), "times": n}
+    for row in rows.values():
+        row["frames/s"] = 1 / row["seconds"]["median"]
+    return {
+        "vertices": len(model.garment.mesh.rest),
+        "steps of training": whole.steps,
+        "frames of the motion": count,
+        "peak memory MB": peak_memory() >> 20,
+        "rows": rows,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    return run(
+        __doc__, benchmark, lambda figures: clocks(figures["rows"], ("frames/s", "mm mean", "mm max")), arguments,
+        steps=(100, "of training, where SCENE is no run"), rank=(64, "of the smaller decoder, at most"),
+        frames=(500, "streamed ones that are timed"), repeats=(7, "timed calls of the others"),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())
