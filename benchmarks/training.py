@@ -4,9 +4,10 @@
 
 Every part is timed inside one compiled loop, as it stands in the scan of a training, on the poses of one batch after some steps
 of training: its value and its derivative, for all poses of the batch. Indented rows are parts of the row above them;
-`descriptors` are computed once a scene and are no part of a step. The least is the time of the matrix products and of the bytes
-that a part cannot avoid (`benchmarks/work.py`), at the rates that this run measures; other arithmetic is not counted, so an
-energy's least is that of reading positions and writing forces.
+`descriptors` are computed once a scene and are no part of a step, nor is `body` where the same frames come again within a chunk
+of steps. The least is the time of the matrix products and of the bytes that a part cannot avoid (`benchmarks/work.py`), at the
+rates that this run measures; other arithmetic is not counted, so an energy's least is that of reading positions and writing
+forces.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ncs_jax import assemble, local_rotations, training
 from ncs_jax.assembly import Assembly
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.methods.ncs import garment_blend
-from ncs_jax.model import Model, pose_body
+from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import track
 from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
 
@@ -105,28 +106,32 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
         x, pull = jax.vjp(lambda offset: pose(offset, matrices[0], model), offsets[0])
         return [x, *(pose(offsets[k], matrices[k], model) for k in range(1, history))], pull(jnp.ones_like(x))
 
+    def simulated(varied, model):
+        offsets, matrices, body = varied
+        return training.physics(model, weights, offsets, matrices, share, body)
+
     posed = jax.jit(skinned)((offsets, matrices), model)[0]
     x, share = posed[0], jnp.ones(len(ends), posed[0].dtype)
     found: dict[str, tuple] = {
         "network": (networks, whole, params, model),
-        "physics": (
-            lambda varied, model: training.physics(model, weights, varied[0], varied[1], share),
-            (offsets, matrices),
-            model,
-        ),
         "skinning": (skinned, (offsets, matrices), model),
     }
     brought: dict[str, dict] = {"inertia": {"previous": posed[1], "before": posed[2]}} if terms.inertia else {}
+    known, body = None, {}
     if model.body is not None:
-        body = jax.jit(pose_body)(model, matrices[0])
         found["body"] = (lambda matrices, model: pose_body(model, matrices), matrices[0], model)
-        brought["collision"] = {"body": body}
+        body = {"body": jax.jit(pose_body)(model, matrices[0])}
+        if terms.collision == "plane" and len(whole.start) < training.CHUNK * len(ends):  # then posed once for all steps
+            known = jnp.moveaxis(posed_bodies(model, whole.matrices[ends], len(ends)), 0, -1)
+            body["normals"] = known[:, 3:]
+        brought["collision"] = body
+    found["physics"] = (simulated, (offsets, matrices, known), model)
     for name in ("membrane", "bending"):
         if value := getattr(terms, name):
             alone = replace(NOTHING, **{name: value})
             found[name] = (lambda x, model, alone=alone: elastic(x, model.garment, model.material, alone), x, model)
     if terms.friction:
-        brought["friction"] = {"body": body, "carried": pose(offsets[1], matrices[0], model)}
+        brought["friction"] = {"body": body["body"], "carried": pose(offsets[1], matrices[0], model)}
     if terms.pinning:
         brought["pinning"] = {"blended": blend(matrices[0], weights)}
     for name in ("collision", "friction", "gravity", "inertia", "pinning", "self_contact"):
@@ -135,7 +140,8 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
 
     def queried(varied, model):
         def one(varied):
-            return distances(*varied, model.surface, terms)
+            x, body = varied
+            return distances(x, body["body"], model.surface, terms, body.get("normals"))
 
         return one(varied) if terms.collision == "plane" else lax.map(one, _front(varied))
 

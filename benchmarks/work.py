@@ -1,9 +1,10 @@
 """What each part of the method cannot avoid, counted from the sizes of a scene and of its parameters: no program is asked.
 
 Arithmetic is that of the matrix products: of dense layers, forward and where a derivative is asked for backward, once for
-every frame that differs; and of skinning, for weights that are not zero. Bytes are those of the parameters, and of the
-positions that one part hands to the next, each read or written once. Between two parts nothing needs to be written, so a whole
-needs fewer bytes than its parts together: a training step those of reading and writing the parameters and Adam's moments.
+every frame that differs; and of skinning, for weights that are not zero. What a motion fixes once, the body's poses and the
+garment's blended matrices, is no work of a training step. Bytes are those of the parameters, and of the positions that one part
+hands to the next, each read or written once. Between two parts nothing needs to be written, so a whole needs fewer bytes than
+its parts together: a training step those of reading and writing the parameters and Adam's moments.
 """
 
 from __future__ import annotations
@@ -51,15 +52,15 @@ def training(assembly: Assembly, params, ends: np.ndarray) -> dict[str, Work]:
         recurring = np.minimum(ends - start, length - 1).sum()  # the first state is zero
         products += 3 * recurring * numbers(params, "recurrent")
     every = sum(leaf.size for leaf in jax.tree.leaves(params))
-    skinning = Work(24.0 * batch * history * weights(model.blend), item * (2 * history + 2) * positions)
+    skinning = Work(6 * positions * (history + 1), item * (2 * history + 2) * positions)
     posing = Work(24.0 * batch * weights(model.body_blend), item * (body + body / batch))
     network = Work(2 * products, item * (2 * every + (history + 1) * positions))
     one = Work(0, item * 2 * positions)
     per_frame = track.static[0].size + track.dynamic[0].size + track.matrices[0].size
     return {
-        "step": Work(network.flops + skinning.flops + posing.flops, item * 6 * every),
+        "step": Work(network.flops + skinning.flops, item * 6 * every),
         "network": network,
-        "physics": Work(skinning.flops + posing.flops, item * (history + 1) * positions),
+        "physics": Work(skinning.flops, item * (history + 1) * positions),
         "skinning": skinning,
         "body": posing,
         "membrane": one,

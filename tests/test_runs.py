@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from ncs_jax.devices import free_memory
 from ncs_jax.errors import InputError
 from ncs_jax.runs import load_run, train
 
@@ -134,3 +135,14 @@ def test_minutes_choose_the_steps(tmp_path, plain_jax):
     assert seen[-1].step == seen[-1].steps == run.steps and run.steps % 10 == 0
     assert time.monotonic() - began < 4 * 15  # an estimate, on a machine that may be doing other things
     assert seen[-1].validation is not None and seen[-1].left == 0
+
+
+def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_path, plain_jax, monkeypatch):
+    scene, out = write_scene(tmp_path), tmp_path / "run"
+    monkeypatch.setattr("ncs_jax.devices.free_memory", lambda: 1000)
+    with pytest.raises(InputError, match=r"training.batch: training does not fit into memory.*1e-06 GB are free"):
+        train(scene, out, steps=10)
+    assert not out.exists() or not any(out.iterdir())
+    monkeypatch.undo()
+    assert free_memory() > 10**6
+    train(scene, out, steps=10)

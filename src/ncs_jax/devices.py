@@ -5,6 +5,8 @@ Where there is one device the mesh is None, and what is handed over comes back a
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
@@ -12,7 +14,7 @@ from jax.sharding import PartitionSpec as P
 
 from ncs_jax.errors import InputError
 
-__all__ = ["batch_mesh", "copied", "divided", "local"]
+__all__ = ["batch_mesh", "compiled", "copied", "divided", "free_memory", "local"]
 
 
 def batch_mesh(batch: int) -> Mesh | None:
@@ -54,3 +56,41 @@ def _spread(sharding: NamedSharding, tree):
 def local(mesh: Mesh | None, tree):
     """This process's first copy of arrays that every device has."""
     return tree if mesh is None else jax.tree.map(lambda a: a.addressable_data(0), tree)
+
+
+def free_memory() -> int | None:
+    """Bytes that a device of this process can still give: the accelerator's own, else the machine's; None where none tells."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    known = []
+    for total, used in (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"), ("/proc/meminfo", None)):
+        try:
+            words = Path(total).read_text().split()
+            if used is None:
+                known.append(1024 * int(words[words.index("MemAvailable:") + 1]))
+            elif words[0] != "max":
+                known.append(int(words[0]) - int(Path(used).read_text()))
+        except (OSError, ValueError):
+            continue
+    return min(known, default=None)
+
+
+def compiled(program, *arguments):
+    """A training program compiled for its arguments, the first of which it may reuse, once it is known to fit into memory.
+
+    Raises:
+        InputError: what it needs beside its arguments is more than is free.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    reused = range(len(jax.tree.leaves(arguments[0])))
+    flat = jax.jit(lambda *leaves: program(*structure.unflatten(leaves)), donate_argnums=reused)
+    ready = flat.lower(*leaves).compile()
+    size, free = ready.memory_analysis(), free_memory()
+    needed = 0 if size is None else size.temp_size_in_bytes + size.output_size_in_bytes - size.alias_size_in_bytes
+    if free is not None and needed > free:
+        raise InputError(
+            "training does not fit into memory", field="training.batch", value=arguments[1].shape[1],
+            mend=f"it needs {needed / 1e9:.3g} GB where {free / 1e9:.3g} GB are free: lower it, or use a coarser garment",
+        )  # fmt: skip
+    return lambda *arguments: ready(*jax.tree.leaves(arguments))

@@ -21,7 +21,7 @@ from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.compression import compress
-from ncs_jax.devices import batch_mesh, copied, divided, local
+from ncs_jax.devices import batch_mesh, compiled, copied, divided, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
@@ -172,13 +172,25 @@ def train(
         pairs = np.stack([np.random.default_rng([seed, 1, s]).permutation(spec.batch) for s in range(first, first + count)])
         return ends, pairs.astype(np.int32)
 
-    def run_steps(state, indices, steps):
-        return run_chunk(state, *divided(mesh, indices), steps, *everywhere)
+    programs: dict[int, Callable] = {}
 
+    def prepared(first, count, state, steps):
+        """A chunk's arguments, its program compiled."""
+        arguments = (state, *divided(mesh, indices(first, count)), steps, *everywhere)
+        if count not in programs:
+            programs[count] = compiled(run_chunk, *arguments)
+        return arguments
+
+    def run_steps(first, count, state, steps):
+        arguments = prepared(first, count, state, steps)
+        return programs[count](*arguments)
+
+    state = initial_state(model, network, seed)
+    if facts is None:  # before anything is written: whether it fits into memory
+        prepared(0, CHUNK if minutes is not None else min(CHUNK, steps or spec.steps), copied(mesh, state), 0)
     if out is not None and facts is None:
         write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict()})
         write_prepared(out, assembly.prepared)
-    state = initial_state(model, network, seed)
     checkpoints = None if out is None else Checkpoints(out)
     every = -(-spec.checkpoint_every // CHUNK) * CHUNK
     check = -(-spec.validate_every // CHUNK) * CHUNK
@@ -187,7 +199,7 @@ def train(
     elif minutes is not None:
 
         def chunk(state):
-            state, _ = run_steps(state, indices(0, CHUNK), CHUNK)
+            state, _ = run_steps(0, CHUNK, state, CHUNK)
             look(model, local(mesh, state.params), track, jnp.arange(4) % frames)
             return jax.block_until_ready(state)
 
@@ -213,14 +225,13 @@ def train(
     log = None if out is None else _Log(out, first)
     dropped, started, pace = int(state.dropped), time.monotonic(), None
     for at, count in chunks(first, steps):
-        ends, pairs = indices(at, count)
-        state, logs = run_steps(state, (ends, pairs), steps)
+        state, logs = run_steps(at, count, state, steps)
         here, logs = local(mesh, (state, logs))
         if pace is None:  # this chunk was compiled
             _give_back()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         done = at + count
-        seen = {k: float(v) for k, v in look(model, here.params, track, ends[-1, :4]).items()}
+        seen = {k: float(v) for k, v in look(model, here.params, track, indices(at, count)[0][-1, :4]).items()}
         message = ""
         if int(here.dropped) > dropped:
             dropped = int(here.dropped)
