@@ -14,16 +14,32 @@ import argparse
 import csv
 import dataclasses
 import multiprocessing
-import resource
 import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax import InputError, Scene, load_scene, measure, scene_from, simulate, summarise, train
+from benchmarks.measure import peak_memory
+from ncs_jax import (
+    InputError,
+    Run,
+    Scene,
+    assemble,
+    load_scene,
+    local_rotations,
+    measure,
+    scene_from,
+    simulate,
+    stepper,
+    summarise,
+    train,
+)
+from ncs_jax.assembly import load_motion, track_of
 from ncs_jax.scene import PRESETS
 
 COLUMNS = {
@@ -68,7 +84,7 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
         return changed(physics={**physics, "collision": {**physics["collision"], **values}})
 
     result = [
-        Point("simulation", scene, True),
+        Point("simulation", changed(), True),
         Point("simulation, tolerance 1 g", changed(simulation={"tolerance": 1.0}), True),
         Point("simulation, 2 substeps", changed(simulation={"substeps": 2}), True),
         Point("simulation, quasi-Newton", changed(simulation={"solver": "quasi_newton"}), True),
@@ -87,16 +103,11 @@ def motion_of(scene: Scene) -> str:
     return (*scene.motion.validation, *scene.motion.files)[0]
 
 
-def peak() -> float:
-    """Most memory this process has had, MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 if sys.platform == "linux" else 1024) / 1e3 * 1.024
-
-
 def trained(point: Point, minutes: float | None, steps: int | None) -> list[dict]:
     """Train a network and measure it, as it is and made smaller: rows with the vertices under "vertices"."""
     began = time.monotonic()
     run = train(point.scene, minutes=minutes, steps=steps)
-    taken, memory = (time.monotonic() - began) / 60, peak()
+    taken, memory = (time.monotonic() - began) / 60, peak_memory() / 1e6
     name = motion_of(point.scene)
     rows = []
     track = run.track(name)
@@ -120,11 +131,9 @@ def simulated(point: Point) -> list[dict]:
     result = simulate(point.scene, name)
     # Judged by the same energies at the same frame rate as the networks, whatever its own substeps.
     lone = dataclasses.replace(result.assembly.scene.motion, fps=point.scene.motion.fps)
-    from ncs_jax.assembly import assemble, load_motion, track_of
-
     assembly = assemble(dataclasses.replace(result.assembly.scene, motion=lone))
     track = track_of(assembly.model, load_motion(assembly.scene, name, assembly.body))
-    row = {"point": point.name, "frame": 1e3 * float(np.median(result.seconds[1:])), "memory": peak()}
+    row = {"point": point.name, "frame": 1e3 * float(np.median(result.seconds[1:])), "memory": peak_memory() / 1e6}
     row |= {"vertices": result.vertices, **summarise(measure(assembly.model, result.vertices, track))}
     return [row]
 
@@ -140,13 +149,8 @@ def median(call, repeats: int = 7) -> float:
     return float(np.median(times))
 
 
-def streamed(run, motion: str) -> float:
+def streamed(run: Run, motion: str) -> float:
     """Median time in s of one frame of a stream with carried state, over the motion."""
-    import jax
-    import jax.numpy as jnp
-
-    from ncs_jax import local_rotations, stepper
-
     model, record = run.assembly.model, run.motion(motion)
     rollout = stepper(model, run.assembly.network, run.params)
     local, way = local_rotations(model, jnp.asarray(record.poses)), jnp.asarray(record.translation)
@@ -175,7 +179,7 @@ def experiment(
             found = alone.submit(*job).result()
         reference = references.setdefault(point.scene.garment.file, found[0])
         for row in found:
-            row["excess"] = 100 * (row["total"] / reference["total"] - 1)
+            row["excess"] = 100 * (row["total"] - reference["total"]) / abs(reference["total"])
             row["distance"] = 1e3 * float(np.linalg.norm(row["vertices"] - reference["vertices"], axis=-1).mean())
             print("  ".join(f"{k} {row[k]:.4g}" if k != "point" else f"{row[k]:28}" for k in COLUMNS if k in row), flush=True)
         rows += found
@@ -211,7 +215,9 @@ def draw(path: Path, rows: list[dict]) -> None:
             preset = row["point"] in PRESETS
             axes.plot(row["frame"], row[key], style, color="C3" if preset else "C0", markersize=7 if preset else 4)
             axes.annotate(row["point"], (row["frame"], row[key]), fontsize=6, xytext=(4, 3), textcoords="offset points")
-        axes.set(xscale="log", yscale="log", xlabel=COLUMNS["frame"], ylabel=COLUMNS[key])
+        if shown:
+            axes.set(xscale="log", yscale="log")
+        axes.set(xlabel=COLUMNS["frame"], ylabel=COLUMNS[key])
         axes.grid(alpha=0.3, which="both")
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path)
