@@ -22,9 +22,9 @@ from ncs_jax.scene import Scene
 COLUMNS = ("total", "membrane", "bending", "collision", "gravity", "inertia", "strain_mean", "penetrating", "out_of_balance")
 
 
-def measure(run: Run) -> dict[str, float]:
-    """Mean of every quantity over all frames of the scene's training motions."""
-    rows = [run.evaluate(name) for name in run.assembly.scene.motion.files]
+def measure(run: Run, *, exact: bool = True) -> dict[str, float]:
+    """Mean of every quantity over all frames of the scene's training motions; `exact` as in `Run.evaluate`."""
+    rows = [run.evaluate(name, exact=exact) for name in run.assembly.scene.motion.files]
     return summarise({name: np.concatenate([r[name] for r in rows]) for name in rows[0]})
 
 

@@ -203,6 +203,7 @@ def test_the_least_time_is_the_longer_of_two():
     assert limits.least(Work(2e9, 1e6)) == 2
     assert limits.least(Work(0, 2e9)) == 2  # beyond every cache
     assert limits.least(Work(0, 4e3)) == 1e-6  # fits into one
+    assert limits.best(Limits(2e9, {COPIES[0]: 1e9, COPIES[2]: 2e9})) == Limits(2e9, {COPIES[0]: 4e9, COPIES[2]: 2e9})
 
 
 def test_a_table_is_aligned():
