@@ -42,7 +42,11 @@ def test_a_preset_takes_the_place_of_the_scenes_own_values(tmp_path):
     for name, tables in PRESETS.items():
         scene = load_scene(path, name)
         assert scene.network.decoder == tables["network"]["decoder"] and scene.training.batch == 5
+        assert scene.network.joint == (9,)
     assert load_scene(path).network.decoder == (7,)
+    assert load_scene(write(tmp_path, ""), "balanced").to_dict() == Scene().to_dict()
+    with pytest.raises(InputError, match="a table expected"):
+        load_scene(write(tmp_path, "network = 3"), "fast")
     sizes = [sum(PRESETS[name]["network"]["decoder"]) for name in ("fast", "balanced", "accurate")]
     assert sizes == sorted(set(sizes))
 

@@ -231,7 +231,10 @@ def train(
             _give_back()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         done = at + count
-        seen = {k: float(v) for k, v in look(model, here.params, track, indices(at, count)[0][-1, :4]).items()}
+        seen = {
+            k: float(v)
+            for k, v in look(model, here.params, track, batches(frames, spec.batch, seed, done - 1, 1)[0, :4]).items()
+        }
         message = ""
         if int(here.dropped) > dropped:
             dropped = int(here.dropped)

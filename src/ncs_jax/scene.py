@@ -212,7 +212,7 @@ class Scene:
 
 PRESETS: dict[str, dict] = {
     "fast": {"network": {"static": (64, 128, 128), "dynamic": (128, 128), "decoder": (128, 128, 128), "modes": 64}},
-    "balanced": {"network": dataclasses.asdict(NetworkSpec())},
+    "balanced": {"network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128}},
     "accurate": {"network": {"static": (64, 128, 256, 512), "dynamic": (512, 512), "decoder": (512, 512, 512), "modes": 128}},
 }  # what `ncs train --preset` puts in place of a scene's own values; experiments/speed_accuracy.py measures them
 
@@ -246,7 +246,8 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", file=file, mend="mend that line") from None
     for table, values in PRESETS[preset].items() if preset else ():
-        tables[table] = {**tables.get(table, {}), **values}
+        if isinstance(own := tables.get(table, {}), dict):
+            tables[table] = {**own, **values}
     return scene_from(tables, source=str(file))
 
 
