@@ -31,29 +31,22 @@ CHARACTERS = (1, 4, 16, 64, 256)
 PLACES = 64  # of the motion, that a crowd goes through
 
 
-def stream(garment: Run, characters: int | None = None) -> Callable:
+def stream(garment: Run, *characters: int) -> Callable:
     """One frame of the first motion as one program, or one of each of several characters, at different places of it."""
     model = garment.assembly.model
     rollout: Any = stepper(model, garment.assembly.network, garment.params)
     record = garment.motion(garment.assembly.scene.motion.files[0])
     rotations, places = local_rotations(model, jnp.asarray(record.poses)), jnp.asarray(record.translation)
-    leaves, form = jax.tree.flatten(rollout.init())
-
-    def plain(leaves, rotations, place):  # of plain arrays: the state of several characters is no state of one
-        state, x = rollout.step(jax.tree.unflatten(form, leaves), rotations, place)
-        return jax.tree.leaves(state), x
-
-    if characters is not None:
+    for several in characters:
         frames = len(places)
-        at = (np.arange(min(frames, PLACES))[:, None] + np.arange(characters) * max(1, frames // characters)) % frames
+        at = (np.arange(min(frames, PLACES))[:, None] + np.arange(several) * max(1, frames // several)) % frames
         rotations, places = rotations[at], places[at]
-        leaves = [jnp.stack([leaf] * characters) for leaf in leaves]
-    program = jax.jit(plain if characters is None else jax.vmap(plain), donate_argnums=0)
-    inputs, held, now = list(zip(list(rotations), list(places), strict=True)), leaves, 0
+    program = jax.jit(rollout.step, donate_argnums=0)
+    inputs, state, now = list(zip(list(rotations), list(places), strict=True)), rollout.init(*characters), 0
 
     def frame():
-        nonlocal held, now
-        held, x = program(held, *inputs[now % len(inputs)])
+        nonlocal state, now
+        state, x = program(state, *inputs[now % len(inputs)])
         now += 1
         return x
 
@@ -97,10 +90,12 @@ def benchmark(options) -> dict:
             "seconds": timed(several, options.repeats, count), "work": work.inference(model, params, count), "times": count,
             **error,
         }  # fmt: skip
-    params = for_inference(whole.assembly.network, whole.params, model)[1]
-    for n in CHARACTERS[:2] if options.quick else CHARACTERS:
-        seconds = timed(stream(whole, n), max(options.repeats, frames // n), n)
-        rows[f"{n} at once, each"] = {"seconds": seconds, "work": work.inference(model, params, n), "times": n}
+    crowds = [("float32", whole, n) for n in (CHARACTERS[:2] if options.quick else CHARACTERS)]
+    crowds += [(name, garment, crowds[-1][2]) for name, garment in smaller.items()]
+    for name, garment, n in crowds:
+        params = for_inference(garment.assembly.network, garment.params, model)[1]
+        seconds = timed(stream(garment, n), max(options.repeats, frames // n), n)
+        rows[f"{n} at once, {name}, each"] = {"seconds": seconds, "work": work.inference(model, params, n), "times": n}
     for row in rows.values():
         row["frames/s"] = 1 / row["seconds"]["median"]
     return {

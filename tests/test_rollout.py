@@ -96,6 +96,25 @@ def test_a_stream_gives_what_the_sequence_gives(tmp_path, plain_jax, alpha):
     np.testing.assert_allclose(np.stack(frames), run(assembly, params, motion, alpha), rtol=0, atol=1e-6)
 
 
+def test_many_characters_move_by_themselves(tmp_path, monkeypatch):
+    """Five who begin at different frames, each with an alpha of its own, in blocks that do not divide them."""
+    monkeypatch.setattr("ncs_jax.rollout.BLOCK", 2)
+    assembly, params, motion = ready(tmp_path)
+    init, step = stepper(assembly.model, assembly.network, params)
+    step = jax.jit(step)
+    rotations = local_rotations(assembly.model, jnp.asarray(motion.poses, jnp.float64))
+    places, alphas = jnp.asarray(motion.translation, jnp.float64), jnp.asarray([0.0, 0.5, 1.0, 1.0, 2.0])
+    crowd, alone = init(len(alphas)), [init() for _ in alphas]
+    for frame in range(4):
+        at = frame + np.arange(len(alphas))
+        crowd, x = step(crowd, rotations[at], places[at], alphas)
+        for i, alpha in enumerate(alphas):
+            alone[i], one = step(alone[i], rotations[at[i]], places[at[i]], alpha)
+            np.testing.assert_allclose(x[i], one, rtol=0, atol=1e-13)
+    for name, leaf in jax.tree.leaves_with_path(jax.tree.map(lambda *a: jnp.stack(a), *alone)):
+        np.testing.assert_allclose(dict(jax.tree.leaves_with_path(crowd))[name], leaf, rtol=0, atol=1e-13)
+
+
 def test_one_linear_map_for_inference(tmp_path):
     assembly, params, _ = ready(tmp_path)
     model, network = assembly.model, assembly.network
