@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.measure import read, run, table
-from benchmarks.training import batch
-from ncs_jax import assemble, training
+from benchmarks.training import batch, ready
+from ncs_jax import training
 from ncs_jax.assembly import Assembly
 from ncs_jax.rollout import animate
 from ncs_jax.rollout import stepper as rollout_of
@@ -67,7 +67,7 @@ def programs(assembly: Assembly) -> dict[str, Callable]:
 
 def benchmark(options) -> dict:
     """Count all programs of a scene; `quick`: but for Newton's, which takes longest to compile."""
-    lowered = programs(assemble(read(options.scene)))
+    lowered = programs(ready(read(options.scene)))
     return {"rows": {name: counted(lower()) for name, lower in lowered.items() if not options.quick or name != "newton"}}
 
 

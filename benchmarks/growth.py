@@ -23,8 +23,8 @@ import numpy as np
 from benchmarks import work
 from benchmarks.inference import stream
 from benchmarks.measure import apart, clocks, forget_peak, peak_memory, read, run, timed
-from benchmarks.training import batch, steps
-from ncs_jax import InputError, Run, assemble, io
+from benchmarks.training import batch, ready, steps
+from ncs_jax import InputError, Run, io
 from ncs_jax.io.npz import write_npz
 from ncs_jax.methods.ncs import for_inference
 from ncs_jax.scene import Scene
@@ -69,8 +69,8 @@ def point(scene: str, repeats: int, garment: int = 1, body: int = 1, **training:
     spec = read(scene)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        assembly = assemble(finer(replace(spec, training=replace(spec.training, **training)), Path(folder), garment, body))
-        ready = time.perf_counter() - start
+        assembly = ready(finer(replace(spec, training=replace(spec.training, **training)), Path(folder), garment, body))
+        reading = time.perf_counter() - start
     model, peaks = assembly.model, {"ready": peak_memory()}
     params = initial_state(model, assembly.network, 0).params
     forget_peak()
@@ -86,7 +86,7 @@ def point(scene: str, repeats: int, garment: int = 1, body: int = 1, **training:
     sizes = {"vertices": len(model.garment.mesh.rest), "body": 0 if model.body is None else len(model.body)}
     sizes |= {name: getattr(assembly.scene.training, name) for name in ("batch", "window")}
     named = {name: {"seconds": seconds[name], "work": needed[name]} for name in seconds}
-    return {"sizes": sizes, "ready": ready, "peak": peaks, "rows": named}
+    return {"sizes": sizes, "ready": reading, "peak": peaks, "rows": named}
 
 
 def benchmark(options) -> dict:

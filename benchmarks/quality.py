@@ -20,8 +20,9 @@ import numpy as np
 
 from benchmarks import work
 from benchmarks.measure import clock, clocks, read, run, table
+from benchmarks.training import ready
 from experiments.seeds import measure
-from ncs_jax import Run, assemble
+from ncs_jax import Run
 from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, initial_state
 
 FALL = (0.5, 0.8, 0.9, 0.95, 0.99)
@@ -31,7 +32,7 @@ SHOWN = {"total": "total J", "strain_mean": "strain %", "penetrating": "inside %
 def benchmark(options) -> dict:
     """Train a scene and measure it again and again; seconds until each energy is reached."""
     steps, every = (2 * CHUNK, CHUNK) if options.quick else (options.steps, options.every)
-    assembly, seed = assemble(read(options.scene)), options.seed
+    assembly, seed = ready(read(options.scene)), options.seed
     model, network, track, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
     program = chunk_runner(network, spec)
 

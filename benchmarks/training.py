@@ -29,13 +29,20 @@ from ncs_jax import assemble, local_rotations, training
 from ncs_jax.assembly import Assembly
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.methods.ncs import garment_blend
-from ncs_jax.model import Model, pose_body, posed_bodies
+from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import track
 from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
+from ncs_jax.scene import Scene
 
 STEPS = 1000  # of the schedule
 NOTHING = Terms(None, bending=False, collision=None, gravity=False, inertia=False)
 DEPTH = {"step": 0, "descriptors": 0, "network": 1, "physics": 1, "optimiser": 1, "contact query": 3}  # all others 2
+
+
+def ready(scene: Scene) -> Assembly:
+    """A scene as training takes it, with what its motions fix."""
+    assembly = assemble(scene)
+    return replace(assembly, track=training.with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
 
 
 def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:
@@ -121,8 +128,8 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
     if model.body is not None:
         found["body"] = (lambda matrices, model: pose_body(model, matrices), matrices[0], model)
         body = {"body": jax.jit(pose_body)(model, matrices[0])}
-        if terms.collision == "plane" and len(whole.start) < training.CHUNK * len(ends):  # then posed once for all steps
-            known = jnp.moveaxis(posed_bodies(model, whole.matrices[ends], len(ends)), 0, -1)
+        if whole.bodies is not None:
+            known = jnp.moveaxis(whole.bodies[ends], 0, -1)
             body["normals"] = known[:, 3:]
         brought["collision"] = body
     found["physics"] = (simulated, (offsets, matrices, known), model)
@@ -168,7 +175,7 @@ def optimiser(assembly: Assembly, state: training.TrainState, ends, pairs) -> tu
 
 def benchmark(options) -> dict:
     """Measure a scene's training step and its parts."""
-    assembly = assemble(read(options.scene))
+    assembly = ready(read(options.scene))
     model, whole = assembly.model, assembly.track
     rounds, count = (2, 2) if options.quick else (ROUNDS, training.CHUNK)
     several, held = steps(assembly, count)

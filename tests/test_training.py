@@ -11,7 +11,7 @@ import pytest
 from ncs_jax.assembly import assemble
 from ncs_jax.energies.collision import vertex_normals
 from ncs_jax.kinematics import blend, skin
-from ncs_jax.model import pose_body, posed_bodies
+from ncs_jax.model import pose_body
 from ncs_jax.objective import Frame, energies
 from ncs_jax.scene import load_scene, scene_from
 from ncs_jax.training import (
@@ -25,6 +25,7 @@ from ncs_jax.training import (
     initial_state,
     physics,
     step_size,
+    with_bodies,
 )
 
 from .scenes import write_scene
@@ -155,16 +156,15 @@ def test_what_a_scene_lacks_is_not_traced(tmp_path, plain_jax, changes, absent):
     assert ("dynamic" in initial_state(assembly.model, assembly.network, 0).params) == (not still)
 
 
-def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path):
+def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path, monkeypatch):
     assembly, spec, ends, pairs = prepared(tmp_path)
     params = initial_state(assembly.model, assembly.network, 0).params
-    known = posed_bodies(assembly.model, assembly.track.matrices, 3)
-    assert known.shape == (len(assembly.track.start), len(assembly.model.body), 6)
+    track = with_bodies(assembly.model, assembly.track, 3)
+    assert track.bodies.shape == (len(track.start), len(assembly.model.body), 6)
     expected, energies, _ = one_gradient(assembly, spec, params, ends[0], pairs[0])
-    f = jax.jit(
-        lambda model, params, track, known: gradients(model, assembly.network, spec, params, track, ends[0], pairs[0], known)
-    )
-    found, parts, _ = f(assembly.model, params, assembly.track, known)
+    found, parts, _ = one_gradient(dataclasses.replace(assembly, track=track), spec, params, ends[0], pairs[0])
+    monkeypatch.setattr("ncs_jax.training.BODIES", track.bodies.nbytes - 1)
+    assert with_bodies(assembly.model, assembly.track, 3) is assembly.track
     for name, energy in energies.items():
         np.testing.assert_allclose(parts[name], energy, rtol=1e-5, err_msg=name)
     size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(expected))

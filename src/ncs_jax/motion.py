@@ -22,13 +22,14 @@ __all__ = ["Track", "input_joints", "mirror", "track"]
 class Track:
     """Motions laid end to end. `start` is the first frame of the motion that a frame belongs to.
 
-    Before its first frame a character is taken to have stood there at rest.
+    Before its first frame a character is taken to have stood there at rest. `bodies` are what `training.with_bodies` adds.
     """
 
     static: Float[Array, "frames joints numbers"]
     dynamic: Float[Array, "frames joints rates"]
     matrices: Float[Array, "frames all 3 4"]
     start: Int[Array, "frames"]
+    bodies: Float[Array, "frames body 6"] | None = None  # positions in m and normals of the touchable body
 
 
 def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joints:

@@ -27,7 +27,7 @@ from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
 from ncs_jax.rollout import animate
 from ncs_jax.scene import Scene, load_scene, scene_from
-from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, glance, initial_state
+from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, glance, initial_state, with_bodies
 
 __all__ = ["Report", "Run", "load_run", "train"]
 
@@ -161,7 +161,8 @@ def train(
     seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
     mesh = batch_mesh(spec.batch)
     run_chunk = chunk_runner(network, spec, mesh)
-    everywhere = copied(mesh, (model, track))  # which waits for every process: from here on, one may write
+    everywhere = copied(mesh, (model, with_bodies(model, track, spec.batch)))
+    # That waited for every process: from here on, one may write.
     if jax.process_index() > 0:
         out = report = None
     look = jax.jit(lambda model, params, track, ends: glance(model, network, spec.window, params, track, ends))

@@ -35,9 +35,11 @@ __all__ = [
     "gradients",
     "initial_state",
     "step_size",
+    "with_bodies",
 ]
 
 CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
+BODIES = 1 << 28  # bytes of posed bodies that are kept, at most
 
 
 @jax.tree_util.register_dataclass
@@ -79,6 +81,21 @@ def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
     zero = jnp.zeros((), jnp.int32)
     fault = Fault(zero, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
     return TrainState(params, ADAM.init(params), zero, zero, fault)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _posed(model: Model, matrices, lanes: int):
+    return posed_bodies(model, matrices, lanes)
+
+
+def with_bodies(model: Model, track: Track, batch: int) -> Track:
+    """The same motions with the bodies of all frames posed, `batch` at a time, where collision is by planes.
+
+    A motion fixes them; a step looks them up. Where they take more than `BODIES` bytes, each step poses those it sees.
+    """
+    if model.terms.collision != "plane" or 2 * len(track.start) * model.body.nbytes > BODIES:
+        return track
+    return replace(track, bodies=_posed(model, track.matrices, batch))
 
 
 def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
@@ -169,9 +186,7 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share, body
     return parts | some, to_offsets, to_all
 
 
-def gradients(
-    model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, known=None, axis: str | None = None
-):
+def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, axis: str | None = None):
     """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
 
     Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample.
@@ -210,7 +225,7 @@ def gradients(
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
     weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
-    body = None if known is None else jnp.moveaxis(known[ends], 0, -1)
+    body = None if track.bodies is None else jnp.moveaxis(track.bodies[ends], 0, -1)
     parts, g, to_weights = physics(model, weights, offsets, matrices, own.astype(last.dtype), body)
     (result,) = transpose(g / ends.shape[0])
     if network.learn_weights:
@@ -227,12 +242,12 @@ def _sample(share, index, axis: str | None):
     return lax.psum(jnp.where(lax.axis_index(axis) == index // size, share[..., index % size], 0), axis)
 
 
-def step(model, network, spec, steps, state: TrainState, track, known, ends, pairs, axis=None) -> tuple[TrainState, dict]:
+def step(model, network, spec, steps, state: TrainState, track, ends, pairs, axis=None) -> tuple[TrainState, dict]:
     """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted.
 
     Within a `shard_map` over `axis`, `ends` and `pairs` are this device's share of the batch and the rest is every device's.
     """
-    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, known, axis)
+    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, axis)
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
     if axis is not None:
         sample_good = lax.all_gather(sample_good, axis, tiled=True)
@@ -264,19 +279,15 @@ def step(model, network, spec, steps, state: TrainState, track, known, ends, pai
 def chunk_runner(network: NCS, spec: TrainingSpec, mesh: Mesh | None = None):
     """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
 
-    `steps` is how many the whole training has, for the schedule. The state's buffers are reused. Where the chunk sees frames
-    more than once, the body is posed once for all its steps. With a mesh of several devices (`devices.batch_mesh`), each works
-    on its part of the batch and takes the same step as the others.
+    `steps` is how many the whole training has, for the schedule. The state's buffers are reused. The track is that of
+    `with_bodies`. With a mesh of several devices (`devices.batch_mesh`), each works on its part of the batch and takes the same
+    step as the others.
     """
-
     axis = None if mesh is None else mesh.axis_names[0]
 
     def run(state, ends, pairs, steps, model, track):
-        repeated = model.terms.collision == "plane" and len(track.start) < ends.size
-        known = posed_bodies(model, track.matrices, spec.batch) if repeated else None
-
         def body(state, indices):
-            return step(model, network, spec, steps, state, track, known, *indices, axis)
+            return step(model, network, spec, steps, state, track, *indices, axis)
 
         return lax.scan(body, state, (ends, pairs))
 
