@@ -83,11 +83,6 @@ def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
     return TrainState(params, ADAM.init(params), zero, zero, fault)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _posed(model: Model, matrices, lanes: int):
-    return posed_bodies(model, matrices, lanes)
-
-
 def with_bodies(model: Model, track: Track, batch: int) -> Track:
     """The same motions with the bodies of all frames posed, `batch` at a time, where collision is by planes.
 
@@ -95,7 +90,7 @@ def with_bodies(model: Model, track: Track, batch: int) -> Track:
     """
     if model.terms.collision != "plane" or 2 * len(track.start) * model.body.nbytes > BODIES:
         return track
-    return replace(track, bodies=_posed(model, track.matrices, batch))
+    return replace(track, bodies=jax.jit(posed_bodies, static_argnums=2)(model, track.matrices, batch))
 
 
 def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
