@@ -96,7 +96,7 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
         Point("simulation", smooth(scene), scene, True),
         Point("simulation, tolerance 1 g", smooth(scene, tolerance=1.0), scene, True),
         Point("simulation, 2 substeps", smooth(scene, substeps=2), scene, True),
-        Point("simulation, quasi-Newton", smooth(scene, solver="quasi_newton"), scene, True),
+        Point("simulation, quasi-Newton, 9 iterations", smooth(scene, solver="quasi_newton", iterations=9), scene, True),
     ]
     result += [Point(name, changed(**tables), scene) for name, tables in PRESETS.items()]
     result += [Point("contact by triangles", contact(distance="triangle"), scene)]
