@@ -26,7 +26,7 @@ from benchmarks.measure import apart, clocks, forget_peak, peak_memory, read, ru
 from benchmarks.training import batch, ready, steps
 from ncs_jax import InputError, Run, io
 from ncs_jax.io.npz import write_npz
-from ncs_jax.methods.ncs import for_inference
+from ncs_jax.methods.shared import for_inference
 from ncs_jax.scene import Scene
 from ncs_jax.training import initial_state
 

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks import work
 from benchmarks.measure import clocks, peak_memory, read, run, timed
 from ncs_jax import Run, load_run, local_rotations, train
-from ncs_jax.methods.ncs import for_inference
+from ncs_jax.methods.shared import for_inference
 from ncs_jax.rollout import animate, stepper
 
 CHARACTERS = (1, 4, 16, 64, 256)

@@ -28,7 +28,7 @@ from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_me
 from ncs_jax import assemble, local_rotations, training
 from ncs_jax.assembly import Assembly
 from ncs_jax.kinematics import blend, skin
-from ncs_jax.methods.ncs import garment_blend
+from ncs_jax.methods.shared import garment_blend
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import track
 from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure

@@ -13,7 +13,7 @@ from benchmarks.cost import counted
 from benchmarks.measure import COPIES, Limits, Work, apart, looped, nudged, table, timed
 from experiments import seeds
 from ncs_jax import assemble, io, load_scene, train
-from ncs_jax.methods.ncs import decode, for_inference, static_codes
+from ncs_jax.methods.shared import decode, for_inference
 from ncs_jax.solver.cholesky import elimination
 from ncs_jax.training import initial_state
 
@@ -86,10 +86,7 @@ def test_the_work_of_a_network_is_that_of_its_products(tmp_path):
     needed = work.inference(model, merged, 1)
 
     def layers(static, dynamic, code):
-        variables = {"params": merged["dynamic"]}
-        features = network.dynamic.apply(variables, dynamic, method="features")
-        code = network.dynamic.apply(variables, code, features, method="step")
-        return decode(network, merged, model, static_codes(network, merged, static) + code)
+        return decode(network, merged, model, network.step(merged, code, static, dynamic)[1].together())
 
     track = assembly.track
     lowered = jax.jit(layers).lower(track.static[0], track.dynamic[0], jnp.zeros(network.dynamic.state))

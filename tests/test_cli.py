@@ -304,6 +304,7 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path / "a.npz"), "--scene", str(scene), "--json"]) == 0
     (again,) = json.loads(capsys.readouterr().out).values()
+    assert whole["mean"].pop("gain") > 0  # over what alpha = 0 gives, which a file does not tell
     for name, value in whole["mean"].items():
         assert again["mean"][name] == pytest.approx(value, rel=2e-3, abs=1e-3), name
     assert main(["evaluate", str(folder)]) == 0
@@ -311,6 +312,21 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     assert "strain_mean [%]" in text and "out_of_balance [g]" in text
     assert main(["evaluate", str(tmp_path / "a.npz")]) == 2
     one_line(capsys, ["--scene"])
+
+
+def test_evaluate_beside_a_reference(run_folder, tmp_path, capsys):
+    _, folder = run_folder
+    assert main(["animate", str(folder), "--out", str(tmp_path / "a.npz")]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(folder), "--reference", str(tmp_path / "a.npz"), "--json"]) == 0
+    (same,) = json.loads(capsys.readouterr().out).values()
+    assert same["mean"]["distance"] < 1e-3 and same["mean"]["dynamic_share"] == pytest.approx(1, abs=1e-4)
+    assert main(["evaluate", str(folder), "--alpha", "3", "--reference", str(tmp_path / "a.npz")]) == 0
+    text = capsys.readouterr().out
+    assert "dynamic_share, speed over" in text and "hem_correlation" in text and "distance [mm]" in text
+    io.write_animation(tmp_path / "b.npz", np.zeros((7, 30, 3), np.float32), grid()[1], 30.0)
+    assert main(["evaluate", str(folder), "--reference", str(tmp_path / "b.npz")]) == 2
+    one_line(capsys, ["b.npz", "vertices", "(7, 30, 3)", "--motion"])
 
 
 def test_an_animation_of_another_motion_is_refused(run_folder, tmp_path, capsys):

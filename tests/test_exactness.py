@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.assembly import assemble, load_motion, track_of
-from ncs_jax.methods.ncs import decode, static_codes, window_codes
+from ncs_jax.methods.shared import decode
 from ncs_jax.model import local_rotations
 from ncs_jax.rollout import animate, stepper
 from ncs_jax.scene import load_scene, scene_from
@@ -205,9 +205,9 @@ def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
     track = track_of(model, motion)
     frames = len(motion.poses)
     ends = jnp.array([frames - 1], jnp.int32)
-    codes = jax.jit(lambda p, t: window_codes(network, p, t, ends, frames, frames))(params, track)
+    codes = jax.jit(lambda p, t: network.windows(p, t, ends, frames, frames))(params, track)
     z_static, z_dynamic = (z[:, 0] for z in codes)
-    np.testing.assert_allclose(static_codes(network, params, track.static), z_static, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(network.codes(params, track)[0], z_static, rtol=0, atol=1e-13)
     offsets = np.moveaxis(np.asarray(decode(network, params, model, z_static + alpha * z_dynamic)), -1, 0)
     blended = np.einsum("vj,fjab->fvab", model.blend.weights, np.asarray(track.matrices)[:, list(model.blend.joints)])
     unposed = np.asarray(model.garment.mesh.rest)[None] + offsets
@@ -221,7 +221,7 @@ def test_a_window_that_begins_within_the_motion_begins_at_rest(tmp_path):
     network = assembly.network
     track = track_of(assembly.model, motion)
     end, length = 17, 6
-    run_window = jax.jit(lambda p, t: window_codes(network, p, t, jnp.array([end, 2], jnp.int32), length, 2))
+    run_window = jax.jit(lambda p, t: network.windows(p, t, jnp.array([end, 2], jnp.int32), length, 2))
     _, z = run_window(params, track)
     h = jnp.zeros(network.dynamic.state)
     for d in track.dynamic[end - length + 1 : end + 1]:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.assembly import assemble, load_motion, track_of
-from ncs_jax.methods.ncs import decode, for_inference, initial_parameters
+from ncs_jax.methods.shared import decode, for_inference, initial_parameters
 from ncs_jax.model import local_rotations
 from ncs_jax.rollout import animate, stepper
 from ncs_jax.scene import load_scene, scene_from
@@ -24,11 +24,13 @@ def shaken(params, key=1):
     return jax.tree.unflatten(tree, moved)
 
 
-def ready(folder, dtype=jnp.float64):
-    assembly = assemble(load_scene(write_scene(folder)), dtype=dtype)
+def ready(folder, dtype=jnp.float64, method="ncs"):
+    tables = load_scene(write_scene(folder)).to_dict()
+    tables["network"]["method"] = method
+    assembly = assemble(scene_from(tables), dtype=dtype)
     params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))
     params = jax.tree.map(lambda p: p.astype(dtype), params)
-    return assembly, params, assembly.motions["swing.npz"]
+    return assembly, params, next(iter(assembly.motions.values()))
 
 
 def run(assembly, params, motion, alpha=1.0):

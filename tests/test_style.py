@@ -39,7 +39,7 @@ BELOW: dict[str, set[str]] = {
     "simulator": {"energies", "kinematics", "model", "motion", "objective", "solver"},
     "model": {"energies", "kinematics", "objective", "rotations"},
     "motion": {"descriptors", "kinematics", "model"},
-    "methods": {"descriptors", "kinematics", "model", "motion", "networks"},
+    "methods": {"descriptors", "kinematics", "model", "motion", "networks", "objective"},
     "rollout": {"descriptors", "kinematics", "methods", "model", "motion"},
     "compression": {"methods", "model", "motion", "networks", "rollout"},
     "training": {"kinematics", "methods", "model", "motion", "numerics", "objective", "scene"},  # of `scene` the numbers alone

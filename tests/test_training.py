@@ -81,22 +81,27 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
             np.testing.assert_allclose(fast[name][i], value, rtol=1e-5, err_msg=name)
 
 
-def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
-    """Against automatic differentiation of the whole chain with x_{t-1} and x_{t-2} held fixed."""
+@pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])
+def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
+    """Against automatic differentiation of the whole chain: x_{t-1} and x_{t-2} are constants to NCS, and not to SNUG."""
     from ncs_jax.kinematics import blend, skin
-    from ncs_jax.methods.ncs import decode, window_codes
+    from ncs_jax.methods.shared import decode
     from ncs_jax.model import pose_body
     from ncs_jax.objective import Frame, total
 
-    assembly, spec, ends, pairs = prepared(tmp_path, dtype=jnp.float64)
+    assembly, spec, ends, pairs = prepared(tmp_path, {"network.method": method}, dtype=jnp.float64)
     model, network, track = assembly.model, assembly.network, assembly.track
+    hold = (lambda x: x) if method == "snug" else jax.lax.stop_gradient
+    terms = network.loss(model.terms)
+    assert (terms.inertia, terms.through_time) == (method != "pbns", method == "snug")
     params = initial_state(model, network, 3).params
     params = jax.tree.map(lambda p: p + 0.02 * jnp.cos(jnp.arange(p.size, dtype=p.dtype)).reshape(p.shape), params)
     ends = ends[0]
 
     def loss(params):
-        a, b = window_codes(network, params, track, ends, spec.window, 3)
-        offsets = decode(network, params, model, a + b)
+        codes = network.windows(params, track, ends, spec.window, 3)
+        assert (codes.dynamic is None) == (method != "ncs")
+        offsets = decode(network, params, model, codes.together())
         result = 0.0
         for i, t in enumerate(np.asarray(ends)):
             at = [max(t - 2, 0), max(t - 1, 0), t]
@@ -104,9 +109,9 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path):
                 skin(blend(track.matrices[f], model.blend), model.garment.mesh.rest + offsets[:, :, k, i])
                 for k, f in enumerate(at)
             ]
-            frame = Frame(1 / model.fps, jax.lax.stop_gradient(x[1]), jax.lax.stop_gradient(x[0]))
+            frame = Frame(1 / model.fps, hold(x[1]), hold(x[0]))
             frame = dataclasses.replace(frame, body=pose_body(model, track.matrices[t]))
-            result += total(x[2], model.garment, model.material, frame, model.terms, model.surface)
+            result += total(x[2], model.garment, model.material, frame, terms, model.surface)
         return result / len(ends)
 
     value, expected = jax.jit(jax.value_and_grad(loss))(params)
@@ -246,7 +251,7 @@ def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, pla
 
 
 def test_learned_skinning_weights_get_a_gradient_and_stay_weights(tmp_path, plain_jax):
-    from ncs_jax.methods.ncs import garment_blend
+    from ncs_jax.methods.shared import garment_blend
 
     assembly, spec, ends, pairs = prepared(tmp_path, {"garment.learn_weights": True})
     run = chunk_runner(assembly.network, spec)

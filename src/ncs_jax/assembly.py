@@ -15,6 +15,9 @@ from ncs_jax.errors import InputError
 from ncs_jax.kinematics import Skeleton, blend, blend_from, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
+from ncs_jax.methods.pbns import PBNS
+from ncs_jax.methods.shared import Method
+from ncs_jax.methods.snug import SNUG
 from ncs_jax.model import Model, local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
 from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track, mirror, track
@@ -48,7 +51,7 @@ class Assembly:
     scene: Scene
     prepared: Prepared
     model: Model
-    network: NCS
+    network: Method
     body: io.BodyRecord | None
     garment: io.GarmentRecord
     track: Track | None
@@ -291,14 +294,15 @@ def track_of(model: Model, *records: io.MotionRecord) -> Track:
     return track(model, local_rotations(model, poses), translation, jnp.asarray(start, jnp.int32))
 
 
-def _network(scene: Scene, model: Model) -> NCS:
+def _network(scene: Scene, model: Model) -> Method:
     spec, (verts, modes), dtype = scene.network, model.basis.shape, model.basis.dtype
-    return NCS(
-        static=StaticEncoder(spec.static, dtype),
-        dynamic=DynamicEncoder(spec.joint, spec.dynamic, spec.static[-1], dtype) if model.moves else None,
-        decoder=Decoder(verts, spec.decoder, modes, dtype=dtype),
-        learn_weights=scene.garment.learn_weights,
-    )
+    decoder, learned, state = Decoder(verts, spec.decoder, modes, dtype=dtype), scene.garment.learn_weights, spec.static[-1]
+    if spec.method == "snug":
+        return SNUG(DynamicEncoder((), spec.dynamic, state, dtype, bias=True), decoder, learned)
+    static = StaticEncoder(spec.static, dtype)
+    if spec.method == "pbns":
+        return PBNS(static, decoder, learned)
+    return NCS(static, DynamicEncoder(spec.joint, spec.dynamic, state, dtype) if model.moves else None, decoder, learned)
 
 
 def _closure(joints, parents) -> list[int]:

@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's)")
     evaluate.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
     evaluate.add_argument("--alpha", type=_finite, default=1.0, help="motion control")
+    evaluate.add_argument(
+        "--reference", metavar="FILE", help="an animation of the same motion, say by ncs simulate, to compare the movement with"
+    )
     evaluate.add_argument("--json", action="store_true", help="print JSON, with every frame")
 
     check = command("check", _check, "read and assemble a scene without training it")
@@ -258,11 +261,12 @@ def _trained(scene, out, steps, minutes, seed, resume):
             text = (
                 f"step {r.step}/{r.steps}  [bold]{sum(r.energies.values()):.4f} J[/bold]  ({parts})\n"
                 f"strain {r.strain:.1f} %  penetrating {r.penetrating:.1f} %  {_clock(r.left)} left"
+                + ("" if r.moved is None else f"  alpha moves {r.moved:.1f} mm")
                 + (f"  dropped {r.dropped}" if r.dropped else "")
             )
             progress.update(task, total=r.steps, completed=r.step, description=text)
             if r.message:
-                progress.print(f"step dropped: {r.message}")
+                progress.print(r.message)
             if r.validation:
                 words = ", ".join(f"{k} {v:.4g}" for k, v in r.validation.items())
                 progress.print(f"step {r.step}: validation {words}")
@@ -350,18 +354,39 @@ def _evaluate(options) -> int:
 
     from ncs_jax import io
     from ncs_jax.assembly import assemble
+    from ncs_jax.dynamics import MEASURES, compare, dynamics
     from ncs_jax.evaluation import QUANTITIES, measure, summarise
     from ncs_jax.runs import Run, load_run
 
     target = Path(options.target)
     if not target.exists():
         raise InputError("no such run folder or animation", file=target, mend="check the path")
-    rows = {}
+    rows, moving = {}, {}
+
+    def look(run, name, track, vertices):
+        model = run.assembly.model
+        rows[name], moving[name] = measure(model, vertices, track), dynamics(model, vertices, track)
+        if options.reference is None:
+            return
+        reference = io.read_animation(options.reference)
+        if reference.vertices.shape != vertices.shape:
+            raise InputError(
+                f"frames, vertices and 3 of the motion expected, {vertices.shape}", file=options.reference, field="vertices",
+                value=reference.vertices.shape, mend="give the --motion that it was made from",
+            )  # fmt: skip
+        moving[name] |= compare(model, vertices, reference.vertices, track)
+
     if target.is_dir() and not options.scene:
         run = load_run(target)
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(_default_motions(run.assembly.scene)))
+        if options.reference is not None and len(names) > 1:
+            raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")
         for name in names:
-            rows[name] = run.evaluate(name, options.alpha)
+            track = run.track(name)
+            look(run, name, track, run.animate(track, options.alpha))
+            if options.alpha != 0 and run.assembly.network.controlled:
+                still = dynamics(run.assembly.model, run.animate(track, 0.0), track)["speed"]
+                moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
     else:
         if not options.scene:
             raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
@@ -370,27 +395,37 @@ def _evaluate(options) -> int:
         names = (options.motion,) if options.motion else _default_motions(scene)
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
-        track = Run(assembly, {}).track(names[0])
+        run = Run(assembly, {})
+        track = run.track(names[0])
         expected = (track.start.shape[0], *assembly.model.garment.mesh.rest.shape)
         if animation.vertices.shape != expected:
             raise InputError(
                 f"frames, vertices and 3 of the scene expected, {expected}", file=target, field="vertices",
                 value=animation.vertices.shape, mend="give the --motion and --scene that it was made from",
             )  # fmt: skip
-        rows[names[0]] = measure(assembly.model, np.asarray(animation.vertices, np.float32), track)
+        look(run, names[0], track, np.asarray(animation.vertices, np.float32))
     if options.json:
-        print(json.dumps({n: {"mean": summarise(r), "frames": {k: v.tolist() for k, v in r.items()}} for n, r in rows.items()}))
+        print(
+            json.dumps(
+                {
+                    n: {"mean": summarise(r) | moving[n], "frames": {k: v.tolist() for k, v in r.items()}}
+                    for n, r in rows.items()
+                }
+            )
+        )
         return 0
-    means = {name: summarise(r) for name, r in rows.items()}
+    means = {name: summarise(r) | moving[name] for name, r in rows.items()}
     if len(means) > 1:
-        means["all"] = {k: float(np.mean([m[k] for m in means.values()])) for k in next(iter(means.values()))}
+        every = dict.fromkeys(k for m in means.values() for k in m)
+        means["all"] = {k: float(np.mean([m[k] for m in means.values() if k in m])) for k in every}
     labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
     width = max(map(len, labels)) + 2
-    for quantity in next(iter(means.values())):
-        unit, text = QUANTITIES.get(quantity, ("J", "energy"))
-        print(f"{quantity} [{unit}], {text}")
+    for quantity in dict.fromkeys(k for m in means.values() for k in m):
+        unit, text = (QUANTITIES | MEASURES).get(quantity, ("J", "energy"))
+        print(f"{quantity} [{unit}], {text}" if unit else f"{quantity}, {text}")
         for name, m in zip(labels, means.values(), strict=True):
-            print(f"  {name:{width}} {m[quantity]:.4g}")
+            if quantity in m:
+                print(f"  {name:{width}} {m[quantity]:.4g}")
     return 0
 
 

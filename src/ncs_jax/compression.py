@@ -7,18 +7,17 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.methods.ncs import NCS, for_inference, static_codes
+from ncs_jax.methods.shared import Method, for_inference
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
 from ncs_jax.networks import Decoder
-from ncs_jax.rollout import dynamic_codes
 
 __all__ = ["compress"]
 
 
 def compress(
-    network: NCS, params: dict, model: Model, track: Track, *, rank: int = 0, bfloat16: bool = False
-) -> tuple[NCS, dict]:
+    network: Method, params: dict, model: Model, track: Track, *, rank: int = 0, bfloat16: bool = False
+) -> tuple[Method, dict]:
     """The same network with a smaller decoder, for `rollout.stepper` and `rollout.animate`.
 
         offsets = b + K h  ~  (b + K m) + V (V^T K) (h - m)
@@ -33,13 +32,11 @@ def compress(
     Raises:
         ValueError: the rank is negative, or above what the motion or the decoder can tell apart.
     """
-    network, params = for_inference(network, params, model)
+    smaller, params = for_inference(network, params, model)
     decoder = dict(params["decoder"])
     if rank:
-        z = static_codes(network, params, track.static)
-        if network.dynamic is not None:
-            z = z + dynamic_codes(network, params, track)
-        features = network.decoder.apply({"params": decoder}, z, method=Decoder.features)
+        z = smaller.codes(params, track).together()
+        features = smaller.decoder.apply({"params": decoder}, z, method=Decoder.features)
         h, kernel, bias = (np.asarray(a, np.float64) for a in (features, *map(decoder["offsets"].get, ("kernel", "bias"))))
         if not 0 < rank <= min(h.shape):
             raise ValueError(f"rank is {rank}; from {h.shape[0]} frames of {h.shape[1]} features it can be 1 to {min(h.shape)}")
@@ -50,7 +47,7 @@ def compress(
         dtype = decoder["offsets"]["kernel"].dtype
         decoder["reduced"] = {"kernel": jnp.asarray(inward, dtype), "bias": jnp.asarray(-mean @ inward, dtype)}
         decoder["offsets"] = {"kernel": jnp.asarray(basis.T, dtype), "bias": jnp.asarray(bias + kernel @ mean, dtype)}
-        network = replace(network, decoder=replace(network.decoder, rank=rank, parent=None, name=None))
+        smaller = replace(smaller, decoder=replace(smaller.decoder, rank=rank, parent=None, name=None))
     if bfloat16:
         decoder["offsets"] = {**decoder["offsets"], "kernel": decoder["offsets"]["kernel"].astype(jnp.bfloat16)}
-    return network, {**params, "decoder": decoder}
+    return smaller, {**params, "decoder": decoder}

@@ -100,7 +100,7 @@ recurrence.defvjp(_recurrence_forward, _recurrence_backward)
 
 
 class DynamicEncoder(nn.Module):
-    """z_D from the dynamic descriptors of a sequence: no bias anywhere, so no motion gives exactly zero.
+    """Codes of a sequence of descriptors. z_D has no bias anywhere, so no motion gives exactly zero.
 
     Every layer maps zero to zero, and a gated recurrent unit without bias halves its state when its input is zero: z_D decays
     to zero when the motion stops. The gates' reset-before-product form is Cho et al. 2014.
@@ -110,10 +110,11 @@ class DynamicEncoder(nn.Module):
     sizes: Sequence[int] = (256, 256)
     state: int = 256
     dtype: DTypeLike = jnp.float32
+    bias: bool = False
 
     def setup(self):
         """Create the layers."""
-        dense = functools.partial(nn.Dense, use_bias=False, param_dtype=self.dtype)
+        dense = functools.partial(nn.Dense, use_bias=self.bias, param_dtype=self.dtype)
         he = nn.initializers.he_normal()
         self.per_joint = [dense(n, kernel_init=he) for n in self.joint_sizes]
         self.joined = [dense(n, kernel_init=he) for n in self.sizes]

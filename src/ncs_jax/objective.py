@@ -78,6 +78,7 @@ class Terms:
     friction: bool = False
     gravity: bool = True
     inertia: bool = True
+    through_time: bool = False  # inertia's target carries a gradient
     pinning: bool = False
     self_contact: bool = False
 
@@ -180,7 +181,8 @@ def energies(
         terms: which terms exist. surface: the touchable body, where there is collision.
 
     Self-contact is NaN where more pairs are near each other than its lists hold: an energy without some of them would be wrong.
-    The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler.
+    The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler;
+    but for `through_time`.
     """
     mesh = garment.mesh
     mass = material.density * mesh.vertex_area
@@ -202,7 +204,8 @@ def energies(
             parts["gravity"] = gravity(x, mass, material.gravity)
     if terms.inertia:
         with jax.named_scope("inertia"):
-            target = lax.stop_gradient(project(frame.previous, frame.before))
+            target = project(frame.previous, frame.before)
+            target = target if terms.through_time else lax.stop_gradient(target)
             parts["inertia"] = inertia(x, target, mass, frame.dt)
     if terms.pinning:
         with jax.named_scope("pinning"):

@@ -55,7 +55,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
         raise InputError("a motion to show is needed", field="motion.files", mend="name one in the scene")
     name = names[0]
     track = run.track(name)
-    alphas = ALPHAS if run.assembly.network.dynamic is not None else (0.0,)
+    alphas = ALPHAS if run.assembly.network.controlled else (0.0,)
     animations = {f"{alpha:g}": run.animate(track, alpha) for alpha in alphas}
     garment = animations["1"] if "1" in animations else animations["0"]
     faces = run.assembly.garment.faces

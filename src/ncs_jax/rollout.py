@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from ncs_jax import descriptors
 from ncs_jax.descriptors import Joints
 from ncs_jax.kinematics import Blend, blend, forward, skin, transforms
-from ncs_jax.methods.ncs import NCS, decode, for_inference, garment_blend, static_codes
+from ncs_jax.methods.shared import Method, decode, for_inference, garment_blend
 from ncs_jax.model import Model
 from ncs_jax.motion import Track, input_joints
 
@@ -42,7 +42,7 @@ class Rollout(NamedTuple):
     step: Callable[..., tuple[State, Array]]
 
 
-def stepper(model: Model, network: NCS, params: dict) -> Rollout:
+def stepper(model: Model, network: Method, params: dict) -> Rollout:
     """A streaming animator: pure functions with explicit state, to be jitted by the caller.
 
     `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`), the root's
@@ -61,8 +61,7 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
         n = len(model.inputs)
         eye = jnp.broadcast_to(jnp.eye(3, dtype=rest.dtype), (*characters, n, 3, 3))
         joints = Joints(eye, eye, jnp.zeros((*characters, n, 3), rest.dtype))
-        size = network.dynamic.state if network.dynamic is not None else 0
-        state = State(jnp.zeros((*characters, size), rest.dtype), joints, joints, jnp.zeros(characters, bool))
+        state = State(jnp.zeros((*characters, network.state), rest.dtype), joints, joints, jnp.zeros(characters, bool))
         return jax.tree.map(jnp.copy, state)  # no two of its arrays are one, so that a caller may donate it
 
     def look(previous: Joints, before: Joints, started, rotations, translation):
@@ -71,7 +70,7 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
         now = input_joints(model, rotations, pose)
         previous, before = (jax.tree.map(lambda old, new: jnp.where(started, old, new), old, now) for old in (previous, before))
         dynamic = None
-        if network.dynamic is not None:
+        if network.state:
             dynamic = descriptors.dynamic(now, previous, before, g, 1 / model.fps, model.descriptor)
         return now, previous, transforms(model.skeleton, pose), descriptors.static(now, g, model.descriptor), dynamic
 
@@ -81,25 +80,15 @@ def stepper(model: Model, network: NCS, params: dict) -> Rollout:
         for _ in characters:
             every = jax.vmap(every)
         now, previous, matrices, static, dynamic = every(state.previous, state.before, state.started, rotations, translation)
-        z, code = static_codes(network, params, static), state.code
-        if network.dynamic is not None:
-            variables = {"params": params["dynamic"]}
-            features = network.dynamic.apply(variables, dynamic, method="features")
-            code = jnp.asarray(network.dynamic.apply(variables, code, features, method="step"))
-            z = z + jnp.asarray(alpha, code.dtype)[..., None] * code
+        code, codes = network.step(params, state.code, static, dynamic)
+        z = codes.together(jnp.asarray(alpha, code.dtype)[..., None])
         x = _posed(model, network, params, weights, matrices.reshape(-1, *matrices.shape[-3:]), z.reshape(-1, z.shape[-1]))
         return State(code, now, previous, jnp.ones(characters, bool)), x.reshape(*characters, *rest.shape)
 
     return Rollout(init, step)
 
 
-def dynamic_codes(network: NCS, params: dict, track: Track) -> Float[Array, "frames code"]:
-    """z_D of every frame of one motion, from rest at its start."""
-    rest = jnp.zeros(network.dynamic.state, track.dynamic.dtype)
-    return jnp.asarray(network.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest))
-
-
-def _posed(model: Model, network: NCS, params: dict, weights: Blend, matrices, z) -> Float[Array, "poses verts 3"]:
+def _posed(model: Model, network: Method, params: dict, weights: Blend, matrices, z) -> Float[Array, "poses verts 3"]:
     """Vertices of the garment with codes (poses, code) on joints (poses, joints, 3, 4), `BLOCK` at a time, m."""
     poses = len(z)
     block = min(BLOCK, poses)
@@ -116,7 +105,7 @@ def _posed(model: Model, network: NCS, params: dict, weights: Blend, matrices, z
 
 
 def animate(
-    model: Model, network: NCS, params: dict, track: Track, alpha: float | Float[Array, ""] | None = 1.0
+    model: Model, network: Method, params: dict, track: Track, alpha: float | Float[Array, ""] | None = 1.0
 ) -> Float[Array, "frames verts 3"]:
     """Vertices of the garment over one whole motion, m: z = z_S + alpha z_D (15), decoded and skinned (16).
 
@@ -124,7 +113,5 @@ def animate(
         track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
             dynamic (alpha = 0 gives the same vertices).
     """
-    z = static_codes(network, params, track.static)
-    if network.dynamic is not None and alpha is not None:
-        z = z + alpha * dynamic_codes(network, params, track)
+    z = network.codes(params, track).together(alpha)
     return _posed(model, network, params, garment_blend(network, params, model), track.matrices, z)

@@ -31,10 +31,15 @@ from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, gla
 
 __all__ = ["Report", "Run", "load_run", "train"]
 
+IDLE = 0.5  # mm that alpha should make a difference of, at least
+
 
 @dataclass(frozen=True)
 class Report:
-    """What training says after every chunk: the step, energies by term in J, strain and penetration in %, time and devices."""
+    """What training says after every chunk: the step, energies by term in J, strain and penetration in %, time and devices.
+
+    `moved`: how far alpha = 1 is from alpha = 0 in mm, where alpha scales anything.
+    """
 
     step: int
     steps: int
@@ -47,6 +52,7 @@ class Report:
     message: str = ""
     validation: dict[str, float] | None = None
     devices: int = 1
+    moved: float | None = None
 
 
 @dataclass(frozen=True)
@@ -239,10 +245,12 @@ def train(
         message = ""
         if int(here.dropped) > dropped:
             dropped = int(here.dropped)
-            message = diagnose(model, network, here.params, track, here.fault)
+            message = "step dropped: " + diagnose(model, network, here.params, track, here.fault)
         validation = None
         if scene.motion.validation and (done % check == 0 or done == steps):
             validation = _validate(Run(assembly, here.params))
+        if not message and seen.get("moved", IDLE) < IDLE and (done % check == 0 or done == steps):
+            message = f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {seen['moved']:.2g} mm"
         now = time.monotonic()
         if pace is None:  # the first chunk compiles: it does not count for the pace
             pace, started = 0.0, now
@@ -250,7 +258,7 @@ def train(
             pace = (now - started) / (done - first - min(CHUNK, count))
         entry = Report(
             done, steps, energies, seen["strain"], seen.get("penetrating", 0.0), dropped, now - began,
-            pace * (steps - done), message, validation, 1 if mesh is None else mesh.size,
+            pace * (steps - done), message, validation, 1 if mesh is None else mesh.size, seen.get("moved"),
         )  # fmt: skip
         if log is not None:
             log.write(entry)
@@ -312,6 +320,7 @@ class _Log:
     def write(self, r: Report) -> None:
         validation = {f"validation_{k}": v for k, v in (r.validation or {}).items()}
         row = {"step": r.step, "total": sum(r.energies.values()), **r.energies, "strain": r.strain}
+        row |= {} if r.moved is None else {"moved": r.moved}
         row |= {"penetrating": r.penetrating, "dropped": r.dropped, "seconds": round(r.seconds, 3)}
         if self._names is None:
             self._names = [*row, "validation_total", "validation_strain_mean", "validation_penetrating"]

@@ -140,12 +140,13 @@ class PhysicsSpec:
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """[network]: sizes of the networks."""
+    """[network]: the method, and the sizes of its networks."""
 
+    method: str = _f("ncs", "ncs; pbns, a pose without motion; snug, one recurrent network", choices=("ncs", "pbns", "snug"))
     descriptor: str = _f("heading_free", "pose descriptor", choices=("heading_free", "six", "quaternion", "axis_angle"))
-    static: tuple[int, ...] = _f((64, 128, 256), "static encoder", low=1, high=65536)
+    static: tuple[int, ...] = _f((64, 128, 256), "static encoder; snug has the last size", low=1, high=65536)
     joint: tuple[int, ...] = _f((32, 32), "dynamic encoder, each joint by itself", low=1, high=65536)
-    dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints", low=1, high=65536)
+    dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints; snug's encoder", low=1, high=65536)
     decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
     modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
 

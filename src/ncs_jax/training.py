@@ -16,7 +16,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
-from ncs_jax.methods.ncs import NCS, decode, garment_blend, initial_parameters, window_codes
+from ncs_jax.methods.shared import Method, decode, garment_blend, initial_parameters
 from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
@@ -75,7 +75,7 @@ def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def initial_state(model: Model, network: NCS, seed: int) -> TrainState:
+def initial_state(model: Model, network: Method, seed: int) -> TrainState:
     """Fresh parameters and a fresh optimiser."""
     params = initial_parameters(network, jax.random.PRNGKey(seed), model)
     zero = jnp.zeros((), jnp.int32)
@@ -181,22 +181,36 @@ def physics(model: Model, weights: Blend, offsets, matrices, inertia_share, body
     return parts | some, to_offsets, to_all
 
 
-def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Track, ends, pairs, axis: str | None = None):
+def _through_time(model: Model, weights: Blend, offsets, matrices, inertia_share):
+    """The gradients of inertia by the offsets of the two frames before, and by the skinning weights that pose them."""
+    x = _pose(model, weights, offsets[0], matrices[0])
+    terms = Terms(None, bending=False, collision=None, gravity=False, through_time=True)
+
+    def value(earlier, weights):
+        frame = Frame(1 / model.fps, *(_pose(model, weights, earlier[k], matrices[1 + k]) for k in (0, 1)))
+        return jnp.sum(inertia_share * energies(x, model.garment, model.material, frame, terms)["inertia"])
+
+    return jax.grad(value, argnums=(0, 1))(list(offsets[1:]), weights)
+
+
+def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: Track, ends, pairs, axis: str | None = None):
     """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
 
     Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample.
-    Positions before the last frame enter as constants, so only that frame is differentiated through the decoder.
+    Positions before the last frame enter as constants, so only that frame is differentiated through the decoder; unless the
+    method's loss goes through time.
     Within a `shard_map` over `axis`, `ends`, `pairs` and what is returned of samples are this device's share of the batch.
     """
+    model = replace(model, terms=network.loss(model.terms))
     history = 3 if model.terms.inertia else 1
-    augmented = round(spec.motion_augmentation * spec.batch) if network.dynamic is not None else 0
+    augmented = round(spec.motion_augmentation * spec.batch) if network.controlled else 0
     number = jnp.arange(ends.shape[0], dtype=ends.dtype)  # in the whole batch
     if axis is not None:
         number = number + lax.axis_index(axis) * ends.shape[0]
     own = number >= augmented
 
     def codes(params):
-        z_static, z_dynamic = window_codes(network, params, track, ends, spec.window, history)
+        z_static, z_dynamic = network.windows(params, track, ends, spec.window, history)
         if z_dynamic is None:
             return z_static
         if not augmented:
@@ -208,21 +222,28 @@ def gradients(model: Model, network: NCS, spec: TrainingSpec, params, track: Tra
         swapped = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
         return jnp.concatenate([swapped, (z_static + z_dynamic)[:, augmented:]], axis=1)
 
-    def last_frame(params):
+    def decoded(params):
         z = codes(params)
-        return decode(network, params, model, z[-1]), z
+        if not model.terms.through_time:
+            return [decode(network, params, model, z[-1])], z
+        every = decode(network, params, model, z)
+        return [every[:, :, k] for k in (2, 1, 0)], z
 
-    last, transpose, z = jax.vjp(last_frame, params, has_aux=True)
-    offsets = [last]
-    if history > 1:
+    offsets, transpose, z = jax.vjp(decoded, params, has_aux=True)
+    if history > len(offsets):
         earlier = decode(network, params, model, z[:-1])
-        offsets += [earlier[:, :, 1], earlier[:, :, 0]]
+        offsets = [*offsets, earlier[:, :, 1], earlier[:, :, 0]]
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], track.start[ends][None])
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
     weights, pull = jax.vjp(lambda p: garment_blend(network, p, model), params)
     body = None if track.bodies is None else jnp.moveaxis(track.bodies[ends], 0, -1)
-    parts, g, to_weights = physics(model, weights, offsets, matrices, own.astype(last.dtype), body)
-    (result,) = transpose(g / ends.shape[0])
+    share = own.astype(offsets[0].dtype)
+    parts, g, to_weights = physics(model, weights, offsets, matrices, share, body)
+    by_frame = [g]
+    if model.terms.through_time:
+        past, more = _through_time(model, weights, offsets, matrices, share)
+        by_frame, to_weights = by_frame + past, jax.tree.map(jnp.add, to_weights, more)
+    (result,) = transpose([g / ends.shape[0] for g in by_frame])
     if network.learn_weights:
         (more,) = pull(jax.tree.map(lambda w: w / ends.shape[0], to_weights))
         result = jax.tree.map(jnp.add, result, more)
@@ -271,7 +292,7 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs, axi
     return TrainState(params, opt, state.step + 1, state.dropped + ~good, fault), logs
 
 
-def chunk_runner(network: NCS, spec: TrainingSpec, mesh: Mesh | None = None):
+def chunk_runner(network: Method, spec: TrainingSpec, mesh: Mesh | None = None):
     """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
 
     `steps` is how many the whole training has, for the schedule. The state's buffers are reused. The track is that of
@@ -301,11 +322,13 @@ def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:
         first = upto
 
 
-def glance(model: Model, network: NCS, window: int, params, track: Track, ends) -> dict[str, Float[Array, ""]]:
-    """Mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames."""
-    z_static, z_dynamic = window_codes(network, params, track, ends, window, 1)
-    z = z_static if z_dynamic is None else z_static + z_dynamic
-    offsets = decode(network, params, model, z[-1])
+def glance(model: Model, network: Method, window: int, params, track: Track, ends) -> dict[str, Float[Array, ""]]:
+    """Mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
+
+    Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
+    """
+    codes = network.windows(params, track, ends, window, 1)
+    offsets = decode(network, params, model, codes.together()[-1])
     weights = garment_blend(network, params, model)
     mesh = model.garment.mesh
 
@@ -321,12 +344,16 @@ def glance(model: Model, network: NCS, window: int, params, track: Track, ends) 
         return result
 
     each = (jnp.moveaxis(offsets, -1, 0), track.matrices[ends])
-    return {k: jnp.mean(v) for k, v in lax.map(one, each).items()}
+    found = {k: jnp.mean(v) for k, v in lax.map(one, each).items()}
+    if codes.dynamic is not None:
+        moved = offsets - decode(network, params, model, codes.static[-1])
+        found["moved"] = 1000 * jnp.mean(norm(jnp.moveaxis(moved, 1, -1)))
+    return found
 
 
-def diagnose(model: Model, network: NCS, params, track: Track, fault: Fault) -> str:
+def diagnose(model: Model, network: Method, params, track: Track, fault: Fault) -> str:
     """Which term of a dropped step went non-finite, in which frame, and at which vertex first."""
-    frame = int(fault.frame)
+    model, frame = replace(model, terms=network.loss(model.terms)), int(fault.frame)
     history = 3 if model.terms.inertia else 1
     back = jnp.maximum(frame - jnp.arange(history), track.start[frame])
     weights = garment_blend(network, params, model)

@@ -2,96 +2,98 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from ncs_jax.descriptors import DESCRIPTORS
-from ncs_jax.kinematics import Blend
+from ncs_jax.methods.shared import Codes, descriptor_sizes
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder, merge
+from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+from ncs_jax.objective import Terms
 
-__all__ = ["NCS", "decode", "for_inference", "garment_blend", "initial_parameters", "static_codes", "window_codes"]
+__all__ = ["NCS"]
 
 
 @dataclass(frozen=True)
 class NCS:
-    """The three networks; `dynamic` is None for a character that never moves."""
+    """The three networks; `dynamic` is None for a character that never moves. See `methods.shared.Method`.
+
+    Source: Bertiche, Madadi, Escalera 2022.
+    """
 
     static: StaticEncoder
     dynamic: DynamicEncoder | None
     decoder: Decoder
     learn_weights: bool = False
 
+    @property
+    def code(self) -> int:
+        """How many numbers a code has."""
+        return self.static.sizes[-1]
 
-def initial_parameters(network: NCS, key: Array, model: Model) -> dict:
-    """Fresh parameters: a plain pytree of arrays."""
-    a, b, c = jax.random.split(key, 3)
-    joints, numbers = len(model.inputs), DESCRIPTORS[model.descriptor]
-    dtype = model.basis.dtype
-    code = jnp.zeros(network.static.sizes[-1], dtype)
-    params = {
-        "static": network.static.init(a, jnp.zeros((joints, numbers + 3), dtype))["params"],
-        "decoder": network.decoder.init(c, code, model.basis)["params"],
-    }
-    if network.dynamic is not None:
-        params["dynamic"] = network.dynamic.init(b, jnp.zeros((1, joints, numbers + 6), dtype), code)["params"]
-    if network.learn_weights:
-        params["blend"] = jnp.zeros_like(model.blend.weights)
-    return params
+    @property
+    def state(self) -> int:
+        """The dynamic code is what is carried."""
+        return 0 if self.dynamic is None else self.dynamic.state
 
+    @property
+    def controlled(self) -> bool:
+        """Whether alpha scales anything."""
+        return self.dynamic is not None
 
-def garment_blend(network: NCS, params: dict, model: Model) -> Blend:
-    """The garment's skinning weights: given, or scaled by learned factors w exp(s) / sum, which keep zeros zero."""
-    if not network.learn_weights:
-        return model.blend
-    scaled = model.blend.weights * jnp.exp(params["blend"])
-    return Blend(scaled / jnp.sum(scaled, axis=-1, keepdims=True), model.blend.joints)
+    def init(self, keys: tuple[Array, Array], model: Model) -> dict:
+        """Fresh parameters of both encoders."""
+        static, dynamic = (jnp.zeros(size, model.basis.dtype) for size in descriptor_sizes(model))
+        params = {"static": self.static.init(keys[0], static)["params"]}
+        if self.dynamic is not None:
+            params["dynamic"] = self.dynamic.init(keys[1], dynamic[None], jnp.zeros(self.state, dynamic.dtype))["params"]
+        return params
 
+    def loss(self, terms: Terms) -> Terms:
+        """All of them, inertia's target a constant: a minimum is a step of implicit Euler."""
+        return terms
 
-def static_codes(
-    network: NCS, params: dict, descriptors: Float[Array, "*frames joints numbers"]
-) -> Float[Array, "*frames code"]:
-    """z_S of single frames."""
-    return jnp.asarray(network.static.apply({"params": params["static"]}, descriptors))
+    def step(self, params: dict, state: Array, static: Array, dynamic: Array | None) -> tuple[Array, Codes]:
+        """z_S of the frame, and z_D, which is the new state."""
+        fixed = self._static(params, static)
+        if self.dynamic is None:
+            return state, Codes(fixed)
+        variables = {"params": params["dynamic"]}
+        features = self.dynamic.apply(variables, dynamic, method="features")
+        state = jnp.asarray(self.dynamic.apply(variables, state, features, method="step"))
+        return state, Codes(fixed, state)
 
+    def codes(self, params: dict, track: Track) -> Codes:
+        """z_S of every frame by itself, and z_D from rest at the motion's start."""
+        fixed = self._static(params, track.static)
+        if self.dynamic is None:
+            return Codes(fixed)
+        rest = jnp.zeros(self.state, track.dynamic.dtype)
+        return Codes(fixed, jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest)))
 
-def decode(network: NCS, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "verts 3 *frames"]:
-    """Offsets in unposed space, m."""
-    return jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
+    def windows(self, params: dict, track: Track, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
+        """Time leading. Frames before a motion's start are rest: zero dynamic descriptors."""
+        start = track.start[ends]
+        back = ends[None] - jnp.arange(length - 1, -1, -1, dtype=ends.dtype)[:, None]
+        inside = jnp.maximum(back, start[None])
+        fixed = self._static(params, track.static[inside[length - last :]])
+        if self.dynamic is None:
+            return Codes(fixed)
+        variables, begun = {"params": params["dynamic"]}, back >= start[None]
+        frames = len(track.dynamic)
+        if frames < back.size:  # windows overlap: what each frame gives by itself is computed once, and picked by a product
+            every = jnp.asarray(self.dynamic.apply(variables, track.dynamic, method="features"))
+            pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
+            features = jnp.einsum("lbf,fg->lbg", pick, every)
+        else:
+            moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
+            features = jnp.asarray(self.dynamic.apply(variables, moving, method="features"))
+        rest = jnp.zeros((ends.shape[0], self.state), features.dtype)
+        states = jnp.asarray(self.dynamic.apply(variables, features, rest, method="states"))
+        return Codes(fixed, states[length - last :])
 
-
-def for_inference(network: NCS, params: dict, model: Model) -> tuple[NCS, dict]:
-    """The same network with the decoder's two linear maps made one."""
-    decoder, decoder_params = merge(network.decoder, params["decoder"], model.basis)
-    return replace(network, decoder=decoder), {**params, "decoder": decoder_params}
-
-
-def window_codes(
-    network: NCS, params: dict, track: Track, ends: Int[Array, "batch"], length: int, last: int
-) -> tuple[Float[Array, "last batch code"], Float[Array, "last batch code"] | None]:
-    """Codes z_S and z_D of the `last` frames of windows of `length` frames that end at `ends`, time leading.
-
-    Frames before a motion's start are rest: zero dynamic descriptors.
-    """
-    start = track.start[ends]
-    back = ends[None] - jnp.arange(length - 1, -1, -1, dtype=ends.dtype)[:, None]
-    inside = jnp.maximum(back, start[None])
-    z_static = static_codes(network, params, track.static[inside[length - last :]])
-    if network.dynamic is None:
-        return z_static, None
-    variables, begun = {"params": params["dynamic"]}, back >= start[None]
-    frames = len(track.dynamic)
-    if frames < back.size:  # windows overlap: what each frame gives by itself is computed once, and picked by a product
-        every = jnp.asarray(network.dynamic.apply(variables, track.dynamic, method="features"))
-        pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
-        features = jnp.einsum("lbf,fg->lbg", pick, every)
-    else:
-        moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
-        features = jnp.asarray(network.dynamic.apply(variables, moving, method="features"))
-    rest = jnp.zeros((ends.shape[0], network.dynamic.state), features.dtype)
-    z_dynamic = jnp.asarray(network.dynamic.apply(variables, features, rest, method="states"))
-    return z_static, z_dynamic[length - last :]
+    def _static(self, params, descriptors):
+        return jnp.asarray(self.static.apply({"params": params["static"]}, descriptors))

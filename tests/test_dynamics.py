@@ -1,0 +1,88 @@
+"""Measures of motion, on motions whose answers are known."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.assembly import assemble, track_of
+from ncs_jax.dynamics import MEASURES, compare, dynamics, hem, stops, unposed
+from ncs_jax.kinematics import blend, skin
+from ncs_jax.scene import load_scene
+
+from .scenes import write_scene
+
+FPS = 30.0
+
+
+def walked(folder, still=60):
+    """A model, and a motion that goes 1 m along x in a second and then stands still."""
+    assembly = assemble(load_scene(write_scene(folder)), dtype=jnp.float64)
+    record = next(iter(assembly.motions.values()))
+    along = np.concatenate([np.linspace(0, 1, 31), np.ones(still)])
+    poses = np.repeat(record.poses[:1], len(along), axis=0)
+    model = dataclasses.replace(assembly.model, fps=FPS)
+    return model, track_of(model, dataclasses.replace(record, poses=poses, translation=along[:, None] * [[1.0, 0, 0]]))
+
+
+def moved(model, track, offsets):
+    """Vertices of a garment that is so far, (frames, 3), from where the body carries its rest shape, as seen from the body."""
+    rest = np.asarray(model.garment.mesh.rest)
+    return np.stack(
+        [np.asarray(skin(blend(m, model.blend), jnp.asarray(rest + o))) for m, o in zip(track.matrices, offsets, strict=True)]
+    )
+
+
+def test_the_body_is_looked_from(tmp_path):
+    model, track = walked(tmp_path)
+    offsets = np.linspace(0, 0.3, len(track.start))[:, None] * [[0, 1.0, 0]]
+    u = unposed(model, moved(model, track, offsets), track)
+    np.testing.assert_allclose(u, np.asarray(model.garment.mesh.rest)[None] + offsets[:, None], rtol=0, atol=1e-12)
+    found = dynamics(model, moved(model, track, offsets), track)
+    step = 0.3 / (len(offsets) - 1)
+    assert found["speed"] == pytest.approx(1000 * FPS * step, rel=1e-9)
+
+
+def test_where_the_character_stops(tmp_path):
+    model, track = walked(tmp_path)
+    assert list(stops(track, FPS)) == [(31, 91)]
+    _, short = walked(tmp_path, still=10)
+    assert list(stops(short, FPS)) == []
+    assert "settling" not in dynamics(model, moved(model, short, np.zeros((41, 3))), short)
+
+
+@pytest.mark.parametrize("damping", [2.0, 5.0])
+def test_settling_and_overshoot_of_a_damped_swing(tmp_path, damping):
+    model, track = walked(tmp_path, still=150)
+    t = np.maximum(np.arange(len(track.start)) - 30, 0) / FPS
+    omega = 8.0
+    swing = np.exp(-damping * t) * np.cos(omega * t)
+    found = dynamics(model, moved(model, track, 0.05 * swing[:, None] * [[1.0, 0, 0]]), track)
+    assert found["overshoot"] == pytest.approx(-100 * swing.min(), rel=1e-3)
+    assert found["settling"] == pytest.approx((np.flatnonzero(np.abs(swing[30:]) > 0.1)[-1] + 1) / FPS, abs=1e-9)
+
+
+@pytest.mark.parametrize("late", [0, 3, 5])
+def test_lag(tmp_path, late):
+    model, track = walked(tmp_path)
+    low = hem(model)
+    carried = moved(model, track, np.zeros((len(track.start), 3)))
+    delayed = carried[np.maximum(np.arange(len(carried)) - late, 0)]
+    assert len(low) >= 1 and dynamics(model, delayed, track)["lag"] == pytest.approx(late / FPS, abs=0.2 / FPS)
+
+
+def test_beside_a_reference(tmp_path):
+    model, track = walked(tmp_path)
+    t = np.arange(len(track.start)) / FPS
+    swing = 0.05 * np.sin(7 * t)[:, None] * [[1.0, 0, 0]]
+    reference = moved(model, track, swing)
+    same = compare(model, reference, reference, track)
+    assert same["dynamic_share"] == pytest.approx(1) and same["stopped_share"] == pytest.approx(1)
+    assert same["hem_correlation"] == pytest.approx(1) and same["distance"] == 0
+    half = compare(model, moved(model, track, swing / 2), reference, track)
+    assert half["dynamic_share"] == pytest.approx(0.5) and half["hem_correlation"] == pytest.approx(1)
+    assert half["distance"] == pytest.approx(1000 * np.abs(swing[:, 0]).mean() / 2, rel=1e-6)
+    rigid = compare(model, moved(model, track, 0 * swing), reference, track)
+    assert rigid["dynamic_share"] == pytest.approx(0, abs=1e-9)
+    assert [*dynamics(model, reference, track), "gain", *half] == list(MEASURES)

@@ -1,0 +1,121 @@
+"""What sets the methods apart, and what they share."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax import load_run, train
+from ncs_jax.assembly import track_of
+from ncs_jax.compression import compress
+from ncs_jax.methods.ncs import NCS
+from ncs_jax.methods.pbns import PBNS
+from ncs_jax.methods.shared import Method
+from ncs_jax.methods.snug import SNUG
+from ncs_jax.model import local_rotations
+from ncs_jax.objective import Frame, Terms, total
+from ncs_jax.rollout import stepper
+from ncs_jax.scene import load_scene, scene_from
+
+from .scenes import write_scene
+from .test_rollout import edited, ready, run
+from .test_training import lowered, prepared, scopes
+
+METHODS = {"ncs": NCS, "pbns": PBNS, "snug": SNUG}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, method):
+    assembly, params, motion = ready(tmp_path, method=method)
+    network = assembly.network
+    assert isinstance(network, METHODS[method]) and isinstance(network, Method)
+    track = track_of(assembly.model, motion)
+    whole, alike = compress(network, params, assembly.model, track, rank=16)
+    expected = run(assembly, params, motion)
+    for net, p, tolerance in ((network, params, 1e-12), (whole, alike, 1e-9)):
+        init, step = stepper(assembly.model, net, p)
+        step, state = jax.jit(step), init()
+        local = local_rotations(assembly.model, jnp.asarray(motion.poses, jnp.float64))
+        for frame, (rotations, place) in enumerate(zip(local, jnp.asarray(motion.translation, jnp.float64), strict=True)):
+            state, x = step(state, rotations, place)
+            np.testing.assert_allclose(x, expected[frame], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method):
+    assembly, params, motion = ready(tmp_path, method=method)
+    track, ends = track_of(assembly.model, motion), jnp.array([5, 9], jnp.int32)
+    whole = assembly.network.codes(params, track)
+    for of_all, of_windows in zip(whole, assembly.network.windows(params, track, ends, 10, 3), strict=True):
+        assert (of_all is None) == (of_windows is None)
+        if of_all is not None:
+            np.testing.assert_allclose(of_windows[:, 1], of_all[7:10], rtol=0, atol=1e-13)
+    # one that would begin before the motion holds its first frame still: no motion yet
+    if method != "snug":  # whose state is not at rest there
+        np.testing.assert_allclose(assembly.network.windows(params, track, ends, 10, 3)[0][:, 0], whole[0][3:6], atol=1e-13)
+
+
+def test_a_pose_alone_decides_with_pbns_and_not_with_the_others(tmp_path):
+    for method in METHODS:
+        assembly, params, motion = ready(tmp_path, method=method)
+        backwards = edited(motion, motion.poses[::-1], motion.translation[::-1])
+        apart = np.abs(run(assembly, params, motion) - run(assembly, params, backwards)[::-1]).max()
+        assert apart < 1e-12 if method == "pbns" else apart > 1e-4
+
+
+def test_alpha_is_for_ncs_alone(tmp_path):
+    for method in METHODS:
+        assembly, params, motion = ready(tmp_path, method=method)
+        apart = np.abs(run(assembly, params, motion, 2.0) - run(assembly, params, motion, 1.0)).max()
+        assert (apart > 1e-4) == assembly.network.controlled == (method == "ncs")
+
+
+def test_snug_sees_the_roots_motion(tmp_path):
+    assembly, params, motion = ready(tmp_path, method="snug")
+    t = np.arange(len(motion.poses))
+    faster = edited(motion, motion.poses, motion.translation + 0.01 * t[:, None] ** 2 * [[1.0, 0, 0]])
+    apart = run(assembly, params, faster) - run(assembly, params, motion)
+    assert np.ptp(apart - faster.translation[:, None] + motion.translation[:, None], axis=1).max() > 1e-5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_where_inertia_has_a_gradient(tmp_path, method, rng):
+    """By x_{t-1} and x_{t-2} exactly none with NCS, the whole of it with SNUG; PBNS has no inertia."""
+    assembly, _, _ = ready(tmp_path, method=method)
+    model = assembly.model
+    terms = assembly.network.loss(Terms(None, bending=False, collision=None))
+    x = model.garment.mesh.rest[None] + jnp.asarray(rng.normal(0, 0.01, (3, *model.garment.mesh.rest.shape)))
+
+    def energy(x):
+        return total(x[0], model.garment, model.material, Frame(1 / model.fps, x[1], x[2]), terms)
+
+    slope = jax.grad(energy)(x)
+    away = np.asarray((x[0] - 2 * x[1] + x[2]) * model.fps**2)
+    mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)[:, None]
+    share = {"ncs": (1, 0, 0), "pbns": (0, 0, 0), "snug": (1, -2, 1)}[method]
+    weight = mass * np.asarray(model.material.gravity)
+    for k in range(3):
+        np.testing.assert_allclose(slope[k], share[k] * mass * away - (weight if k == 0 else 0), rtol=1e-9, atol=1e-12)
+
+
+def test_pbns_traces_no_inertia(tmp_path, plain_jax):
+    assembly, spec, ends, pairs = prepared(tmp_path, {"network.method": "pbns"})
+    text = lowered(assembly, spec, ends, pairs)
+    assert "inertia" not in scopes(text) and not re.search("DynamicEncoder", text)
+    assert assembly.model.terms.inertia  # by which it is still judged
+
+
+@pytest.mark.parametrize("method", ["pbns", "snug"])
+def test_training_and_coming_back(tmp_path, plain_jax, method):
+    tables = load_scene(write_scene(tmp_path)).to_dict()
+    tables["network"]["method"] = method
+    reports = []
+    made = train(scene_from(tables, source=str(tmp_path / "scene.toml")), tmp_path / "run", steps=40, report=reports.append)
+    assert sum(reports[-1].energies.values()) < sum(reports[0].energies.values())
+    assert reports[-1].moved is None and not any(r.message for r in reports)
+    again = load_run(tmp_path / "run")
+    assert isinstance(again.assembly.network, METHODS[method])
+    motion = made.assembly.scene.motion.files[0]
+    np.testing.assert_array_equal(again.animate(motion), made.animate(motion))
