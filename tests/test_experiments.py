@@ -2,11 +2,12 @@
 
 import csv
 
+import numpy as np
 import pytest
 
-from experiments import fit_material, seeds, speed_accuracy
+from experiments import fit_material, methods, seeds, speed_accuracy
 
-from .scenes import write_scene
+from .scenes import SCENE, swing, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -50,3 +51,17 @@ def test_speed_accuracy(tmp_path, capsys):
     assert (out / "speed_accuracy.md").read_text().count("\n") == 2 + len(rows)
     assert (out / "speed_accuracy.png").read_bytes()[:4] == b"\x89PNG"
     assert speed_accuracy.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+def test_methods(tmp_path, capsys):
+    scene, out = write_scene(tmp_path, SCENE.replace('validation = ["swing.npz"]', "")), tmp_path / "out"
+    np.savez(tmp_path / "sway.npz", **swing(size=0.3))
+    assert methods.main([str(scene), "--quick", "--unseen", str(tmp_path / "sway.npz"), "--out", str(out)]) == 0
+    with (out / "methods.csv").open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert list(rows) == ["simulation", "pbns", "snug", "ncs"]
+    assert float(rows["simulation"]["distance"]) == 0 and float(rows["simulation"]["dynamic_share"]) == 1
+    assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")
+    assert (out / "methods.md").read_text().count("\n") == 2 + len(rows)
+    assert len(list((out / "simulations").iterdir())) == 1 and len(list(out.glob("*.png"))) == 1
+    assert methods.main([str(tmp_path / "nowhere.toml")]) == 2
