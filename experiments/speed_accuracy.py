@@ -12,13 +12,10 @@ converge. Writes speed_accuracy.csv, .md and .png. `--quick` is for trying it ou
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
-import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measure import peak_memory
+from experiments.study import apart, changed, write
 from ncs_jax import (
     InputError,
     Run,
@@ -35,7 +33,6 @@ from ncs_jax import (
     load_scene,
     local_rotations,
     measure,
-    scene_from,
     simulate,
     stepper,
     summarise,
@@ -76,21 +73,11 @@ class Point:
 def points(scene: Scene, finer: str | None) -> list[Point]:
     """The points of the curve; those of a finer garment file, where there is one, come with its own simulation."""
 
-    def changed(**tables):
-        new = scene.to_dict()
-        for table, values in tables.items():
-            new[table] = {**new[table], **values}
-        return scene_from(new, source=scene.source)
-
     def contact(**values):
-        physics = scene.to_dict()["physics"]
-        return changed(physics={**physics, "collision": {**physics["collision"], **values}})
+        return changed(scene, physics={"collision": values})
 
     def smooth(scene, **simulation):
-        tables = scene.to_dict()
-        tables["physics"]["collision"]["distance"] = "smooth"
-        tables["simulation"] |= simulation
-        return scene_from(tables, source=scene.source)
+        return changed(scene, physics={"collision": {"distance": "smooth"}}, simulation=simulation)
 
     result = [
         Point("simulation", smooth(scene), scene, True),
@@ -98,11 +85,11 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
         Point("simulation, 2 substeps", smooth(scene, substeps=2), scene, True),
         Point("simulation, quasi-Newton, 9 iterations", smooth(scene, solver="quasi_newton", iterations=9), scene, True),
     ]
-    result += [Point(name, changed(**tables), scene) for name, tables in PRESETS.items()]
+    result += [Point(name, changed(scene, **tables), scene) for name, tables in PRESETS.items()]
     result += [Point("contact by triangles", contact(distance="triangle"), scene)]
     result += [Point("contact by candidates", contact(search="candidates"), scene)]
     if finer is not None:
-        fine = changed(garment={"file": finer})
+        fine = changed(scene, garment={"file": finer})
         result += [Point("simulation, finer mesh", smooth(fine), fine, True), Point("finer mesh", fine, fine)]
     return result
 
@@ -181,33 +168,19 @@ def experiment(
     """Measure every point, write the tables and the picture into `out`, and return the rows."""
     out.mkdir(parents=True, exist_ok=True)
     rows: list[dict] = []
-    spawn = multiprocessing.get_context("spawn")
     references: dict[str, dict] = {}  # by garment file
     wanted = [point for point in points(scene, finer) if not only or point.name in ("simulation", *only)]
     for point in wanted:
-        job = (simulated, point) if point.simulated else (trained, point, minutes, steps)
-        with ProcessPoolExecutor(1, mp_context=spawn) as alone:
-            found = alone.submit(*job).result()
+        found = apart(simulated, point) if point.simulated else apart(trained, point, minutes, steps)
         reference = references.setdefault(point.scene.garment.file, found[0])
         for row in found:
             row["excess"] = 100 * (row["total"] - reference["total"]) / abs(reference["total"])
             row["distance"] = 1e3 * float(np.linalg.norm(row["vertices"] - reference["vertices"], axis=-1).mean())
             print("  ".join(f"{k} {row[k]:.4g}" if k != "point" else f"{row[k]:28}" for k in COLUMNS if k in row), flush=True)
         rows += found
-        write(out, [{k: row.get(k, "") for k in (*COLUMNS, "total")} for row in rows])
+        write(out, "speed_accuracy", [{k: row[k] for k in (*COLUMNS, "total") if k in row} for row in rows], COLUMNS)
     draw(out / "speed_accuracy.png", rows)
     return rows
-
-
-def write(out: Path, rows: list[dict]) -> None:
-    """The rows as CSV and as a Markdown table."""
-    with (out / "speed_accuracy.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, rows[0])
-        table.writeheader()
-        table.writerows(rows)
-    lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
-    lines += ["| " + " | ".join(v if isinstance(v := row[k], str) else f"{v:.3g}" for k in COLUMNS) + " |" for row in rows]
-    (out / "speed_accuracy.md").write_text("\n".join(lines) + "\n")
 
 
 def draw(path: Path, rows: list[dict]) -> None:

@@ -405,14 +405,8 @@ def _evaluate(options) -> int:
             )  # fmt: skip
         look(run, names[0], track, np.asarray(animation.vertices, np.float32))
     if options.json:
-        print(
-            json.dumps(
-                {
-                    n: {"mean": summarise(r) | moving[n], "frames": {k: v.tolist() for k, v in r.items()}}
-                    for n, r in rows.items()
-                }
-            )
-        )
+        frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}
+        print(json.dumps({n: {"mean": summarise(r) | moving[n], "frames": frames[n]} for n, r in rows.items()}))
         return 0
     means = {name: summarise(r) | moving[name] for name, r in rows.items()}
     if len(means) > 1:
