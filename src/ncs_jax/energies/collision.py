@@ -102,9 +102,11 @@ def surface_from(
 
     `posed`: the two in some poses of the motion, from which to tell what is usually near what; at rest where there is none.
     `smooth`: for `nearby_quadrics`, which takes smaller groups of the body; otherwise for the searches, where the sizes are a
-    balance of what a group looks at, what it proves at once and what is left to be searched in full.
+    balance of what a group looks at, what it proves at once and what is left to be searched in full (a coarse garment: smaller
+    groups that look at more, since its far corners leave less proved).
     """
-    cloth_size, body_size, groups = (24, 4, 40) if smooth else (16, 8, 32)
+    fine = (16, 8, 32) if len(cloth) >= 2048 else (8, 8, 64)
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else fine
     cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
     cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
     cloth_blocks = compact_groups(cloth, cloth_size)
