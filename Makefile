@@ -5,7 +5,7 @@ CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" 
 INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
 	$(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS))
 
-.PHONY: demo test test-all bench lint format assets clean
+.PHONY: demo test test-all bench study lint format assets clean
 
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
@@ -24,6 +24,11 @@ BENCHMARKS = training inference quality simulator growth
 bench: .venv/installed
 	mkdir -p runs/bench
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name $(SCENE) --json runs/bench/$$name.json || exit; done
+
+# Every experiment, and the page of them all, experiments/README.md. About an hour and a quarter.
+study: .venv/installed
+	rm -rf runs/study
+	$(BIN)/python -m experiments
 
 lint: .venv/ready
 	$(BIN)/ruff check .

@@ -1,127 +1,99 @@
-"""PBNS, SNUG, NCS and a simulation, side by side: the same garment, energies, decoder and time of training.
+"""PBNS, SNUG, NCS and a simulation, side by side: the same garment, energies, decoder and steps of training.
 
-    python -m experiments.methods [SCENE] [--minutes 4] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick] [--out runs/methods]
+    python -m experiments.methods [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick] [--out runs/methods]
 
 Every network is trained on the scene's motions but the unseen ones, in a process of its own, and judged on those beside the
-simulation: energies, strain, penetration, and how it moves (`ncs_jax.dynamics.MEASURES`). Writes methods.csv, .md and .png, a
-strip of the same frames of all four for each motion. `--quick` is for trying it out: its numbers mean nothing.
+simulation: energies, strain, penetration and how it moves (`ncs_jax.dynamics.MEASURES`), after a stop on the first
+motion that has one. Writes methods.csv, .md and .png, a strip of the same frames of all four for each motion.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from experiments.speed_accuracy import streamed
-from experiments.study import apart, changed, judged, reference, write
-from ncs_jax import InputError, Run, Scene, assemble, load_scene, train
-from ncs_jax.preview import posed_body
+from experiments.study import COLUMNS, apart, changed, command, judged_on, reference, trained, without, write
+from ncs_jax import Run, Scene, assemble
 
 METHODS = ("pbns", "snug", "ncs")
-UNSEEN = ("ncs:mixed", "ncs:walk_turn_stop")
-COLUMNS = {
-    "method": "",
-    "motion": "on",
-    "total": "energy, J",
-    "strain_mean": "strain, %",
-    "penetrating": "inside, %",
-    "dynamic_share": "dynamic share",
-    "stopped_share": "after a stop",
-    "settling": "settling, s",
-    "overshoot": "overshoot, %",
-    "lag": "lag, s",
-    "hem_correlation": "hem correlation",
-    "distance": "mm to simulation",
-    "minutes": "training, min",
-    "frame": "ms a frame",
-}
 
 
-def trained(scene: Scene, unseen: Sequence[str], kept: Path, minutes: float | None, steps: int | None) -> list[dict]:
-    """Train the scene's method and judge it on the unseen motions: a row each, the vertices in it."""
-    began = time.monotonic()
-    run = train(scene, minutes=minutes, steps=steps)
-    taken = (time.monotonic() - began) / 60
-    rows = []
-    for motion in unseen:
-        x = run.animate(motion)
-        row = {"method": scene.network.method, "motion": motion, **judged(run, motion, x, reference(scene, motion, kept))}
-        rows.append(row | {"minutes": taken, "frame": 1e3 * streamed(run, motion), "vertices": x})
-    return rows
+def learned(scene: Scene, unseen: Sequence[str], steps: int, kept: Path) -> tuple[dict, list[np.ndarray]]:
+    """Train the scene's method: its row, and its animations of the unseen motions."""
+    run, minutes = trained(scene, steps, kept)
+    found = [run.animate(motion) for motion in unseen]
+    row = {"method": scene.network.method, **judged_on(run, unseen, found, kept), "minutes": minutes}
+    return row | {"frame": 1e3 * streamed(run, unseen[0])}, found
 
 
-def simulated(scene: Scene, unseen: Sequence[str], kept: Path) -> list[dict]:
+def simulated(scene: Scene, unseen: Sequence[str], kept: Path) -> tuple[dict, list[np.ndarray]]:
     """The simulation, judged like the others."""
-    run, rows = Run(assemble(scene), {}), []
-    for motion in unseen:
-        x = reference(scene, motion, kept)
-        rows.append({"method": "simulation", "motion": motion, **judged(run, motion, x, x), "vertices": x})
+    found = [reference(scene, motion, kept) for motion in unseen]
+    run = Run(assemble(scene), {})
+    return {"method": "simulation", **judged_on(run, unseen, found, kept)}, found
+
+
+def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path, name: str = "methods") -> list[dict]:
+    """Measure all four, write the table and the strips into `out`, and return the rows."""
+    scene = without(scene, unseen)
+    made = [apart(simulated, scene, unseen, kept)]
+    made += [apart(learned, changed(scene, network={"method": method}), unseen, steps, kept) for method in METHODS]
+    rows = [row for row, _ in made]
+    write(out, name, rows, {"method": "", **COLUMNS, "lag": "lag, s", "frame": "ms a frame"})
+    run = Run(assemble(scene), {})
+    for k, motion in enumerate(unseen):
+        file = out / f"{name}_{Path(motion.removeprefix('ncs:')).stem}.png"
+        draw(file, run, motion, {row["method"]: animations[k] for row, animations in made})
     return rows
 
 
-def experiment(
-    scene: Scene, out: Path, unseen: Sequence[str] = UNSEEN, *, minutes: float | None = 4.0, steps: int | None = None
-) -> list[dict]:
-    """Measure all four, write the table and the strips into `out`, and return the rows."""
-    seen = tuple(name for name in scene.motion.files if name not in unseen)
-    scene = changed(scene, motion={"files": seen, "validation": ()})
-    kept = out / "simulations"
-    rows = apart(simulated, scene, unseen, kept)
-    for method in METHODS:
-        rows += apart(trained, changed(scene, network={"method": method}), unseen, kept, minutes, steps)
-    told = [{key: value for key, value in row.items() if key != "vertices"} for row in rows]
-    write(out, "methods", told, COLUMNS)
-    draw(scene, out, rows)
-    return told
-
-
-def draw(scene: Scene, out: Path, rows: Sequence[dict]) -> None:
-    """For each motion, the contact sheets of all methods below each other."""
+def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -> None:
+    """The contact sheets of all methods below each other."""
     from PIL import Image, ImageDraw
 
     from ncs_jax.pictures import INK, PAPER, contact_sheet
+    from ncs_jax.preview import posed_body
 
-    run = Run(assemble(scene), {})
-    for motion in dict.fromkeys(row["motion"] for row in rows):
-        sheets = []
-        for row in (row for row in rows if row["motion"] == motion):
-            file = out / "sheet.png"
-            body = None if run.assembly.body is None else posed_body(run.assembly.body, run.motion(motion))
-            faces = None if run.assembly.body is None else run.assembly.body.faces
-            contact_sheet(file, row["vertices"], run.assembly.garment.faces, body, faces, run.assembly.model.fps, tile=260)
+    a = run.assembly
+    body, faces = (None, None) if a.body is None else (posed_body(a.body, run.motion(motion)), a.body.faces)
+    sheets = []
+    with tempfile.TemporaryDirectory() as folder:
+        for method, vertices in animations.items():
+            file = Path(folder) / "sheet.png"
+            contact_sheet(file, vertices, a.garment.faces, body, faces, a.model.fps, tile=260)
             with Image.open(file) as drawn:
-                sheets.append((row["method"], drawn.convert("RGB")))
-            file.unlink()
-        strip = Image.new("RGB", (max(s.width for _, s in sheets), sum(s.height for _, s in sheets)), PAPER)
-        top = 0
-        for method, sheet in sheets:
-            strip.paste(sheet, (0, top))
-            ImageDraw.Draw(strip).text((60, top + 8), method.upper() if len(method) < 5 else method, INK)
-            top += sheet.height
-        strip.save(out / f"methods_{Path(motion.removeprefix('ncs:')).stem}.png", optimize=True)
+                sheets.append((method, drawn.convert("RGB")))
+    strip = Image.new("RGB", (max(s.width for _, s in sheets), sum(s.height for _, s in sheets)), PAPER)
+    top = 0
+    for method, sheet in sheets:
+        strip.paste(sheet, (0, top))
+        ImageDraw.Draw(strip).text((60, top + 8), method.upper() if len(method) < 5 else method, INK)
+        top += sheet.height
+    strip.save(path, optimize=True)
+
+
+def conclusion(rows: Sequence[dict]) -> str:
+    """What the numbers say."""
+    by = {row["method"]: row for row in rows}
+    sim, ncs, pbns, snug = (by[name] for name in ("simulation", "ncs", "pbns", "snug"))
+    near = 0.7 <= ncs["dynamic_share"] <= 1.3
+    moves = "moves as much as the simulation to within 30 %" if near else "does not move as much as the simulation"
+    text = f"NCS {moves} ({ncs['dynamic_share']:.2f} of its speed, hem correlation {ncs['hem_correlation']:.2f}, "
+    text += f"{ncs['distance']:.1f} mm from it), SNUG {snug['dynamic_share']:.2f}, PBNS {pbns['dynamic_share']:.2f}"
+    if "stopped_share" in ncs:
+        text += f"; after a stop NCS still moves ({ncs['stopped_share']:.2f}), PBNS stands ({pbns['stopped_share']:.2f})"
+        text += f", and NCS settles in {ncs['settling']:.2f} s where the simulation takes {sim['settling']:.2f} s"
+    return text + "."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
-    parser.add_argument("--minutes", type=float, default=4.0, help="of training, for every network (default: 4)")
-    parser.add_argument("--unseen", nargs="+", default=UNSEEN, metavar="MOTION", help="what none is trained on")
-    parser.add_argument("--quick", action="store_true", help="20 steps of training")
-    parser.add_argument("--out", default="runs/methods", help="folder for the table and the pictures")
-    options = parser.parse_args(arguments)
-    try:
-        length = {"steps": 20, "minutes": None} if options.quick else {"minutes": options.minutes}
-        rows = experiment(load_scene(options.scene), Path(options.out), options.unseen, **length)
-    except InputError as error:
-        print(f"methods: {error}", file=sys.stderr)
-        return 2
-    for row in rows:
-        print("  ".join(f"{k} {row[k]:.4g}" if isinstance(row[k], float) else f"{row[k]:12}" for k in COLUMNS if k in row))
-    return 0
+    return command("methods", __doc__ or "", experiment, arguments)
 
 
 if __name__ == "__main__":

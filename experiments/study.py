@@ -1,22 +1,47 @@
-"""What the experiments share: scenes changed field by field, references by simulation, a process for each point, tables."""
+"""What the experiments share: scenes changed field by field, simulations and trained runs kept, tables, a command line."""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import hashlib
 import json
 import multiprocessing
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
-from ncs_jax import Run, Scene, scene_from, simulate, summarise
+from ncs_jax import InputError, Run, Scene, assemble, load_scene, scene_from, simulate, summarise, train
 from ncs_jax.dynamics import compare, dynamics
 from ncs_jax.evaluation import measure
 from ncs_jax.io.npz import write_npz
+from ncs_jax.methods.shared import Method
+from ncs_jax.motion import Track
+from ncs_jax.training import batches, chunk_runner, chunks, initial_state, with_bodies
+
+UNSEEN = ("ncs:mixed", "ncs:walk_turn_stop")  # the second has a stop
+KEPT = Path("runs/study")
+# What a table of networks has to say of each.
+COLUMNS = {
+    "total": "energy, J",
+    "strain_mean": "strain, %",
+    "penetrating": "inside, %",
+    "dynamic_share": "dynamic share",
+    "hem_correlation": "hem correlation",
+    "distance": "mm to simulation",
+    "stopped_share": "after a stop",
+    "settling": "settling, s",
+    "overshoot": "overshoot, %",
+    "minutes": "training, min",
+}
 
 
 def changed(scene: Scene, **tables: dict) -> Scene:
@@ -29,6 +54,15 @@ def changed(scene: Scene, **tables: dict) -> Scene:
     return scene_from(merged(scene.to_dict(), tables), source=scene.source)
 
 
+def without(scene: Scene, unseen: Sequence[str]) -> Scene:
+    """The scene trained on its motions but these, and not validated."""
+    return changed(scene, motion={"files": tuple(name for name in scene.motion.files if name not in unseen), "validation": ()})
+
+
+def _named(*told: Any) -> str:
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
     """The scene's garment simulated over a motion, (frames, verts, 3) in m: made once, and read from the folder after that.
 
@@ -37,12 +71,36 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
     smooth = changed(scene, physics={"collision": {"distance": "smooth"}}, network={"modes": 0})
     tables = smooth.to_dict()
     told = [motion, scene.motion.fps, *(tables[name] for name in ("body", "garment", "physics", "simulation"))]
-    file = kept / f"{hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]}.npz"
+    file = kept / "simulations" / f"{_named(told)}.npz"
     if not file.exists():
-        kept.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         write_npz(file, vertices=simulate(smooth, motion).vertices)
     with np.load(file, allow_pickle=False) as arrays:
         return arrays["vertices"]
+
+
+def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
+    """The scene's network after so many steps, and how many minutes they took: trained once, and read after that."""
+    folder = kept / "trained" / _named(scene.to_dict(), steps)
+    run = train(scene, folder, steps=steps, resume=(folder / "run.json").exists())
+    with (folder / "log.csv").open(newline="") as file:
+        seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
+    return run, seconds[-1] / 60
+
+
+def fitted(scene: Scene, altered: Callable[[Any, Track], Method], steps: int) -> tuple[Run, float]:
+    """As `trained`, of a network that no scene file names. Nothing is kept."""
+    began, a, spec = time.monotonic(), assemble(scene), scene.training
+    if a.track is None:
+        raise InputError("a motion to train on expected", file=scene.source, field="motion.files")
+    a = replace(a, network=altered(a.network, a.track))
+    run, track, frames = chunk_runner(a.network, spec), with_bodies(a.model, a.track, spec.batch), len(a.track.start)
+    state = initial_state(a.model, a.network, spec.seed)
+    for at, count in chunks(0, steps):
+        ends = batches(frames, spec.batch, spec.seed, at, count)
+        state, _ = run(state, ends, np.zeros_like(ends), steps, a.model, track)
+    params = jax.block_until_ready(state.params)
+    return Run(a, params, steps), (time.monotonic() - began) / 60
 
 
 def judged(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
@@ -50,6 +108,25 @@ def judged(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -
     model, track = run.assembly.model, run.track(motion)
     found = summarise(measure(model, vertices, track)) | dynamics(model, vertices, track)
     return found | compare(model, vertices, simulated, track)
+
+
+def judged_on(run: Run, motions: Sequence[str], animations: Sequence[np.ndarray], kept: Path) -> dict[str, float]:
+    """The same on several motions: what the first has nothing to say of, such as a stop, is from the next."""
+    found: dict[str, float] = {}
+    for motion, vertices in zip(motions, animations, strict=True):
+        found = judged(run, motion, vertices, reference(run.assembly.scene, motion, kept)) | found
+    return found
+
+
+def network(scene: Scene, motions: Sequence[str], steps: int, kept: Path) -> dict[str, float]:
+    """Train the scene's network and judge it on the motions."""
+    run, minutes = trained(scene, steps, kept)
+    return judged_on(run, motions, [run.animate(motion) for motion in motions], kept) | {"minutes": minutes}
+
+
+def networks(scenes: dict[str, Scene], motions: Sequence[str], steps: int, kept: Path, what: str = "network") -> list[dict]:
+    """The same of several scenes, each in a process of its own: a row each, named by its key."""
+    return [{what: name, **apart(network, scene, motions, steps, kept)} for name, scene in scenes.items()]
 
 
 def apart(job: Callable, *arguments: Any) -> Any:
@@ -70,6 +147,66 @@ def write(out: Path, name: str, rows: Sequence[dict], columns: dict[str, str]) -
     def shown(value: Any) -> str:
         return f"{value:.3g}" if isinstance(value, float) else str(value)
 
+    columns = {key: heading for key, heading in columns.items() if any(key in row for row in rows)}
+
     lines = ["| " + " | ".join(columns.values()) + " |", "|---" * len(columns) + "|"]
     lines += ["| " + " | ".join(shown(row.get(key, "")) for key in columns) + " |" for row in rows]
     (out / f"{name}.md").write_text("\n".join(lines) + "\n")
+
+
+def command(name: str, doc: str, experiment: Callable, arguments: Sequence[str] | None) -> int:
+    """Run an experiment(scene, unseen, steps, out, kept) from the command line, and show its table."""
+    parser = argparse.ArgumentParser(prog=name, description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
+    parser.add_argument("--steps", type=int, default=2000, help="of training, for every network (default: 2000)")
+    parser.add_argument("--unseen", nargs="+", default=UNSEEN, metavar="MOTION", help="what none is trained on")
+    parser.add_argument("--quick", action="store_true", help="20 steps, to try it out: the numbers mean nothing")
+    parser.add_argument("--out", default=f"runs/{name}", help=f"folder for the table and the picture (default: runs/{name})")
+    parser.add_argument("--kept", default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")
+    o = parser.parse_args(arguments)
+    try:
+        experiment(load_scene(o.scene), tuple(o.unseen), 20 if o.quick else o.steps, Path(o.out), Path(o.kept))
+    except InputError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    print((Path(o.out) / f"{name}.md").read_text(), end="")
+    return 0
+
+
+@contextmanager
+def axes_of(path: Path, count: int, size: tuple[float, float] = (4.0, 3.6)) -> Iterator[Any]:
+    """So many axes beside each other, saved as a PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(1 + count * size[0], size[1]), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    every = figure.subplots(1, count, squeeze=False)[0]
+    yield every
+    for axes in every:
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def bars(path: Path, rows: Sequence[dict], key: str, columns: dict[str, str]) -> None:
+    """A bar for every row that has it, of each column."""
+    with axes_of(path, len(columns), (3.6, 1.2 + 0.3 * len(rows))) as every:
+        for place, (axes, (name, heading)) in enumerate(zip(every, columns.items(), strict=True)):
+            axes.barh([row[key] for row in rows], [row.get(name, 0) for row in rows], color="C0", height=0.6)
+            values = [row[name] for row in rows if name in row]
+            if name == "total":  # what sets energies apart is little of them
+                axes.set_xlim(min(values) - 0.5 * np.ptp(values), max(values) + 0.1 * np.ptp(values))
+            axes.invert_yaxis()
+            axes.set_xlabel(heading)
+            if place:
+                axes.set_yticklabels([])
+
+
+def lines(path: Path, rows: Sequence[dict], key: str, columns: dict[str, str]) -> None:
+    """Each column over another one."""
+    with axes_of(path, len(columns), (3.2, 3.0)) as every:
+        for axes, (name, heading) in zip(every, columns.items(), strict=True):
+            axes.plot([row[key] for row in rows], [row[name] for row in rows], marker="o", markersize=3)
+            axes.set(xlabel=key, ylabel=heading)

@@ -5,7 +5,20 @@ import csv
 import numpy as np
 import pytest
 
-from experiments import fit_material, methods, seeds, speed_accuracy
+from experiments import (
+    architecture,
+    augmentation,
+    budget,
+    control,
+    descriptors,
+    falling,
+    fit_material,
+    membranes,
+    methods,
+    seeds,
+    speed_accuracy,
+    study,
+)
 
 from .scenes import SCENE, swing, write_scene
 
@@ -53,15 +66,104 @@ def test_speed_accuracy(tmp_path, capsys):
     assert speed_accuracy.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
-def test_methods(tmp_path, capsys):
+@pytest.fixture
+def alone(monkeypatch):
+    """Everything in this process: starting others takes longer than what they do here."""
+    for module in (study, architecture, budget, control, descriptors, methods):
+        monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
+
+
+def studied(module, tmp_path, *more):
+    """Run an experiment of the study at its smallest: its rows by the first column, as read from the CSV."""
     scene, out = write_scene(tmp_path, SCENE.replace('validation = ["swing.npz"]', "")), tmp_path / "out"
-    np.savez(tmp_path / "sway.npz", **swing(size=0.3))
-    assert methods.main([str(scene), "--quick", "--unseen", str(tmp_path / "sway.npz"), "--out", str(out)]) == 0
-    with (out / "methods.csv").open() as file:
-        rows = {row["method"]: row for row in csv.DictReader(file)}
+    np.savez(tmp_path / "sway.npz", **swing(frames=40, size=0.3))
+    given = ["--quick", "--unseen", str(tmp_path / "sway.npz"), "--out", str(out), "--kept", str(tmp_path / "kept"), *more]
+    assert module.main([str(scene), *given]) == 0
+    name = module.__name__.rpartition(".")[2]
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in out.glob("*.png")) and list(out.glob(f"{name}*.png"))
+    with (out / f"{name}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert (out / f"{name}.md").read_text().count("\n") == 2 + len(rows)
+    told = module.conclusion([{k: number(v) for k, v in row.items()} for row in rows])
+    assert told.endswith(".") and "nan" not in told
+    assert module.main([str(tmp_path / "nowhere.toml")]) == 2
+    return {next(iter(row.values())): row for row in rows}
+
+
+def number(text):
+    """As it was before it was written."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def test_methods(alone, tmp_path):
+    rows = studied(methods, tmp_path)
     assert list(rows) == ["simulation", "pbns", "snug", "ncs"]
     assert float(rows["simulation"]["distance"]) == 0 and float(rows["simulation"]["dynamic_share"]) == 1
     assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")
-    assert (out / "methods.md").read_text().count("\n") == 2 + len(rows)
-    assert len(list((out / "simulations").iterdir())) == 1 and len(list(out.glob("*.png"))) == 1
-    assert methods.main([str(tmp_path / "nowhere.toml")]) == 2
+    # the motion stops: a pose without motion stands at once
+    assert float(rows["pbns"]["stopped_share"]) == 0 < float(rows["snug"]["stopped_share"])
+    assert len(list((tmp_path / "kept" / "simulations").iterdir())) == 1
+
+
+@pytest.mark.slow
+def test_descriptors(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(descriptors, "DESCRIPTORS", ("heading_free", "six"))
+    rows = studied(descriptors, tmp_path)
+    assert list(rows) == ["heading_free", "six", "six, gravity not seen"]
+    assert float(rows["heading_free"]["turned"]) < 0.01 < 0.1 < float(rows["six"]["turned"])
+    assert rows["six"]["unseen_total"] != rows["six, gravity not seen"]["unseen_total"]
+
+
+@pytest.mark.slow
+def test_architecture(alone, tmp_path):
+    rows = studied(architecture, tmp_path)
+    ours, one, bias, window, linear = rows.values()
+    for row in (ours, window, linear):  # without bias, no motion is nothing
+        assert float(row["before"]) < 1e-3 and float(row["left_2000"]) < 1e-3 < float(row["left_0"])
+    assert float(bias["before"]) > 1e-3 < float(one["before"])
+
+
+@pytest.mark.slow
+def test_augmentation(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(augmentation, "SHARES", (0.5,))
+    rows = studied(augmentation, tmp_path)
+    assert list(rows) == ["none", "motion, 0.5 of a batch", "mirror"]
+    assert len({row["total"] for row in rows.values()}) == 3
+
+
+@pytest.mark.slow
+def test_control(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "ALPHAS", np.array([0.0, 1.0, 3.0]))
+    still, one, three = studied(control, tmp_path).values()
+    assert float(still["speed"]) < float(one["speed"]) < float(three["speed"])
+
+
+@pytest.mark.slow
+def test_budget(alone, tmp_path, monkeypatch):
+    for name, values in {"WINDOWS": (6,), "BATCHES": (4,), "RATES": (15.0, 60.0)}.items():
+        monkeypatch.setattr(budget, name, values)
+    rows = studied(budget, tmp_path)
+    assert list(rows)[-1] == "trained at 60 frames/s, used at 60" and len(rows) == 7
+    assert all(float(row["distance"]) > 0 for row in rows.values())
+
+
+@pytest.mark.slow
+def test_membranes(alone, tmp_path, monkeypatch):
+    chosen = {name: membranes.MEMBRANES[name] for name in ("stvk", "neo_hookean")}
+    monkeypatch.setattr(membranes, "MEMBRANES", chosen)
+    rows = studied(membranes, tmp_path)
+    # uniaxial strain: S = (lam + 2 mu) (l^2 - 1) / 2, whose force S l is greatest at 1/sqrt(3)
+    assert float(rows["stvk"]["yields"]) == pytest.approx(1 / np.sqrt(3), abs=0.01)
+    assert rows["neo_hookean"]["yields"] == "never"
+
+
+@pytest.mark.slow
+def test_falling(tmp_path, capsys):
+    assert falling.main(["--quick", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "falling.csv").open() as file:
+        rows = {(row["case"], row["inertia"]): row for row in csv.DictReader(file)}
+    assert len(rows) == 6 and (tmp_path / "falling.png").read_bytes()[:4] == b"\x89PNG"
+    assert float(rows["free fall", "simulation"]["mean"]) == pytest.approx(1, abs=1e-4)

@@ -1,0 +1,50 @@
+"""Does augmentation help on motions that were not trained on? Another window's motion on a pose, and mirrored motions.
+
+    python -m experiments.augmentation [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
+
+`training.motion_augmentation` is the share of a batch that has another window's dynamic code on its static code;
+`motion.mirror` adds every motion in a mirror. Writes augmentation.csv, .md and .png.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.study import COLUMNS, bars, changed, command, networks, without, write
+from ncs_jax import Scene
+
+SHARES = (0.25, 0.5)
+
+
+def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
+    """Measure all, write the table and the picture into `out`, and return the rows."""
+    scene = without(scene, unseen)
+    scenes = {"none": changed(scene, training={"motion_augmentation": 0.0}, motion={"mirror": False})}
+    scenes |= {f"motion, {share:g} of a batch": changed(scene, training={"motion_augmentation": share}) for share in SHARES}
+    scenes["mirror"] = changed(scene, motion={"mirror": True})
+    rows = networks(scenes, unseen, steps, kept, "augmentation")
+    write(out, "augmentation", rows, {"augmentation": "", **COLUMNS})
+    bars(out / "augmentation.png", rows, "augmentation", {key: COLUMNS[key] for key in ("total", "dynamic_share", "distance")})
+    return rows
+
+
+def conclusion(rows: Sequence[dict]) -> str:
+    """What the numbers say."""
+    none, *others = rows
+
+    def told(row):
+        change = 100 * (row["total"] / none["total"] - 1)
+        return f"{row['augmentation']}: energy {change:+.2f} %, {row['distance'] - none['distance']:+.1f} mm"
+
+    return f"Against none ({none['total']:.4f} J, {none['distance']:.1f} mm): " + "; ".join(map(told, others)) + "."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    return command("augmentation", __doc__ or "", experiment, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

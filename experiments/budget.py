@@ -1,0 +1,75 @@
+"""What does training need? Window, batch, number of motions; a network trained at 15, 30 or 60 frames/s used at all three.
+
+    python -m experiments.budget [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
+
+Windows, batches and numbers of motions are changed one at a time from the scene's own and trained for as many steps. Writes
+budget.csv, .md and .png.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from experiments.study import COLUMNS, apart, bars, changed, command, judged, networks, reference, trained, without, write
+from ncs_jax import Scene, assemble
+
+WINDOWS, BATCHES, RATES = (5, 15, 30), (8, 32, 64), (15.0, 30.0, 60.0)
+
+
+def used(scene: Scene, motion: str, steps: int, kept: Path) -> list[dict]:
+    """Train at the scene's frame rate, use at all of them: a row each."""
+    run, minutes = trained(scene, steps, kept)
+    rows = []
+    for fps in RATES:
+        other = assemble(changed(scene, motion={"fps": fps}), prepared=run.assembly.prepared)
+        there = replace(run, assembly=other)
+        row = judged(there, motion, there.animate(motion), reference(other.scene, motion, kept))
+        rows.append({"change": f"trained at {scene.motion.fps:g} frames/s, used at {fps:g}", **row, "minutes": minutes})
+    return rows
+
+
+def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
+    """Measure all, write the table and the picture into `out`, and return the rows."""
+    scene = without(scene, unseen)
+    files = scene.motion.files
+    scenes = {f"window of {n}": changed(scene, training={"window": n}) for n in WINDOWS}
+    scenes |= {f"batch of {n}": changed(scene, training={"batch": n}) for n in BATCHES}
+    counts = sorted({min(n, len(files)) for n in (1, 3, len(files))})
+    # the last ones, which move most
+    scenes |= {f"{n} of {len(files)} motions": changed(scene, motion={"files": files[-n:]}) for n in counts}
+    rows = networks(scenes, unseen, steps, kept, "change")
+    for fps in RATES:
+        rows += apart(used, changed(scene, motion={"fps": fps}), unseen[0], steps, kept)
+    write(out, "budget", rows, {"change": "", **COLUMNS})
+    bars(out / "budget.png", rows, "change", {key: COLUMNS[key] for key in ("dynamic_share", "distance", "minutes")})
+    return rows
+
+
+def conclusion(rows: Sequence[dict]) -> str:
+    """What the numbers say."""
+    by = {row["change"]: row for row in rows}
+
+    def best(what):
+        some = [row for name, row in by.items() if what in name and "frames/s" not in name]
+        return min(some, key=lambda row: row["distance"])["change"]
+
+    def rate(a, b):
+        row = by[f"trained at {a:g} frames/s, used at {b:g}"]
+        return f"{row['distance']:.1f} mm ({row['dynamic_share']:.2f} of the simulation's speed)"
+
+    return (
+        f"Nearest to the simulation are a {best('window')}, a {best('batch')} and {best('motions')}; trained at 15 frames/s "
+        f"and used at 60 it is {rate(15, 60)} away, trained at 60 and used there {rate(60, 60)}."
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    return command("budget", __doc__ or "", experiment, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

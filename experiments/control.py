@@ -1,0 +1,72 @@
+"""Motion control: what alpha, the scale of the dynamic code, does to speed, strain, penetration and energy.
+
+    python -m experiments.control [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
+
+One network, trained on the scene's motions but the unseen ones, animates the first of those with alpha from 0 to 3. A result
+counts as usable while no more than 1 % of the vertices are inside the body and the mean strain is at most twice that of
+alpha = 1. Writes control.csv, .md and .png.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.study import apart, command, judged, lines, reference, trained, without, write
+from ncs_jax import Scene
+
+ALPHAS = np.arange(0, 3.01, 0.25)
+INSIDE, STRAIN = 1.0, 2.0  # %, of the strain at alpha = 1
+COLUMNS = {
+    "alpha": "alpha",
+    "speed": "speed, mm/s",
+    "dynamic_share": "of the simulation's",
+    "strain_mean": "strain, %",
+    "penetrating": "inside, %",
+    "total": "energy, J",
+    "distance": "mm to simulation",
+    "usable": "usable",
+}
+
+
+def measured(scene: Scene, motion: str, steps: int, kept: Path) -> list[dict]:
+    """A row for each alpha."""
+    run, _ = trained(scene, steps, kept)
+    simulated = reference(scene, motion, kept)
+    return [{"alpha": float(a), **judged(run, motion, run.animate(motion, a), simulated)} for a in ALPHAS]
+
+
+def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
+    """Measure all, write the table and the picture into `out`, and return the rows."""
+    rows = apart(measured, without(scene, unseen), unseen[0], steps, kept)
+    strain = next(row["strain_mean"] for row in rows if row["alpha"] == 1)
+    for row in rows:
+        good = row.get("penetrating", 0) <= INSIDE and row["strain_mean"] <= STRAIN * strain
+        row["usable"] = "yes" if good else "no"
+    write(out, "control", rows, COLUMNS)
+    lines(out / "control.png", rows, "alpha", {key: COLUMNS[key] for key in ("speed", "strain_mean", "penetrating", "total")})
+    return rows
+
+
+def conclusion(rows: Sequence[dict]) -> str:
+    """What the numbers say."""
+    still, one = rows[0], next(row for row in rows if row["alpha"] == 1)
+    usable = [row["alpha"] for row in rows if row["usable"] == "yes" and row["alpha"] >= 1]
+    upto = f"usable up to alpha = {max(usable):g}" if usable else "not usable at alpha = 1"
+    return (
+        f"From alpha = 0 to {rows[-1]['alpha']:g} the garment's speed goes from {still['speed']:.0f} over {one['speed']:.0f} "
+        f"(alpha = 1) to {rows[-1]['speed']:.0f} mm/s, strain from {still['strain_mean']:.2f} to "
+        f"{rows[-1]['strain_mean']:.2f} %; the result is {upto} by the measure above."
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    return command("control", __doc__ or "", experiment, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,129 @@
+"""Which pose descriptor? Axis-angle, quaternion, 6D, and 6D without a heading; 6D also without the gravity direction.
+
+    python -m experiments.descriptors [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
+
+Each is trained on the scene's motions but the unseen ones, and measured on the first of those, on the last it was trained on,
+and on the first unseen one turned about gravity: by how many mm the result differs from the turned result. Writes
+descriptors.csv, .md and .png.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.study import apart, bars, changed, command, fitted, judged, reference, trained, without, write
+from ncs_jax import Run, Scene, local_rotations
+from ncs_jax.descriptors import DESCRIPTORS
+from ncs_jax.methods.ncs import NCS
+from ncs_jax.methods.shared import Method
+from ncs_jax.motion import Track, track
+from ncs_jax.rotations import axis_angle_to_matrix
+
+TURN = 135.0  # degrees
+SIX = DESCRIPTORS["six"]
+COLUMNS = {
+    "descriptor": "",
+    "unseen_total": "unseen: energy, J",
+    "unseen_distance": "mm to simulation",
+    "unseen_hem_correlation": "hem correlation",
+    "seen_total": "seen: energy, J",
+    "seen_distance": "mm to simulation ",
+    "turned": f"turned by {TURN:.0f} degrees: mm from the turned result",
+    "turned_total": "energy there, J",
+}
+
+
+class WithoutGravity(NCS):
+    """Does not see which way is down."""
+
+    def _blind(self, descriptor, first):
+        return descriptor.at[..., first : first + 3].set(0)
+
+    def step(self, params, state, static, dynamic):
+        """As without the gravity direction and its rate."""
+        return super().step(params, state, self._blind(static, SIX), None if dynamic is None else self._blind(dynamic, SIX))
+
+    def codes(self, params, track):
+        """As without the gravity direction and its rate."""
+        return super().codes(params, self._blinded(track))
+
+    def windows(self, params, track, ends, length, last):
+        """As without the gravity direction and its rate."""
+        return super().windows(params, self._blinded(track), ends, length, last)
+
+    def _blinded(self, track):
+        return replace(track, static=self._blind(track.static, SIX), dynamic=self._blind(track.dynamic, SIX))
+
+
+def without_gravity(network: Any, track: Track) -> Method:
+    """The same networks, blind to it."""
+    return WithoutGravity(network.static, network.dynamic, network.decoder, network.learn_weights)
+
+
+def turned(run: Run, motion: str) -> tuple[np.ndarray, Track]:
+    """The rotation about gravity, and the motion as it is after it."""
+    model, record = run.assembly.model, run.motion(motion)
+    down = model.material.gravity / jnp.linalg.norm(model.material.gravity)
+    turn = axis_angle_to_matrix(-jnp.radians(TURN) * down)
+    local, root = local_rotations(model, jnp.asarray(record.poses)), model.skeleton.joints[0]
+    local = local.at[:, 0].set(jnp.matmul(turn, local[:, 0], precision="highest"))
+    way = jnp.matmul(jnp.asarray(record.translation) + root, turn.T, precision="highest") - root
+    return np.asarray(turn, np.float64), track(model, local, way, jnp.zeros(len(local), jnp.int32))
+
+
+def measured(scene: Scene, unseen: str, steps: int, kept: Path, blind: bool) -> dict:
+    """Train, and measure on the three motions."""
+    run, minutes = fitted(scene, without_gravity, steps) if blind else trained(scene, steps, kept)
+    row: dict[str, float] = {"minutes": minutes}
+    for name, motion in (("unseen", unseen), ("seen", scene.motion.files[-1])):
+        found = judged(run, motion, run.animate(motion), reference(scene, motion, kept))
+        row |= {f"{name}_{key}": value for key, value in found.items()}
+    turn, way = turned(run, unseen)
+    away = run.animate(way) - run.animate(unseen).astype(np.float64) @ turn.T
+    row["turned_total"] = float(run.evaluate(way)["total"].mean())
+    return row | {"turned": 1000 * float(np.linalg.norm(away, axis=-1).mean())}
+
+
+def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
+    """Measure all, write the table and the picture into `out`, and return the rows."""
+    scene = without(scene, unseen)
+    rows = []
+    for name, blind in (*((name, False) for name in DESCRIPTORS), ("six", True)):
+        row = apart(measured, changed(scene, network={"descriptor": name}), unseen[0], steps, kept, blind)
+        rows.append({"descriptor": f"{name}, gravity not seen" if blind else name, **row})
+    write(out, "descriptors", rows, COLUMNS)
+    bars(
+        out / "descriptors.png",
+        rows,
+        "descriptor",
+        {key: COLUMNS[key] for key in ("unseen_total", "unseen_distance", "turned")},
+    )
+    return rows
+
+
+def conclusion(rows: Sequence[dict]) -> str:
+    """What the numbers say."""
+    best = min(rows, key=lambda row: row["unseen_total"])
+    free = next(row for row in rows if row["descriptor"] == "heading_free")
+    worst = max(rows, key=lambda row: row["turned"])
+    return (
+        f"On the unseen motion the lowest energy is that of {best['descriptor']} ({best['unseen_total']:.4f} J; heading_free "
+        f"{free['unseen_total']:.4f} J); turned about gravity, heading_free gives the same to {free['turned']:.2g} mm, "
+        f"{worst['descriptor']} is {worst['turned']:.2g} mm off."
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    return command("descriptors", __doc__ or "", experiment, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
