@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.typing import DTypeLike
+from jaxtyping import Array
 
-from experiments.study import COLUMNS, apart, axes_of, command, fitted, judged_on, trained, without, write
+from experiments.study import COLUMNS, apart, axes_of, changed, command, fitted, judged_on, trained, without, write
 from ncs_jax import Run, Scene
 from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
@@ -43,84 +41,18 @@ MEASURED = COLUMNS | {
 }
 
 
-class LinearEncoder(nn.Module):
-    """In place of the gated unit a diagonal linear recurrence h_t = lambda h_{t-1} + sqrt(1 - |lambda|^2) f_t, complex.
-
-    |lambda| = exp(-exp(nu)) < 1 whatever is learned: it contracts, each number of it a decaying oscillation, and all frames can
-    be computed at once. Source: Orvieto et al. 2023, with no skip or normalisation. The interface is `DynamicEncoder`'s.
-    """
-
-    joint_sizes: Sequence[int] = (32, 32)
-    sizes: Sequence[int] = (256, 256)
-    state: int = 256
-    dtype: DTypeLike = jnp.float32
-
-    def setup(self):
-        """Create the layers; time constants from 1 to 20 frames, periods from 6 frames on."""
-        he = nn.initializers.he_normal()
-        self.per_joint = [nn.Dense(n, use_bias=False, param_dtype=self.dtype, kernel_init=he) for n in self.joint_sizes]
-        self.joined = [nn.Dense(n, use_bias=False, param_dtype=self.dtype, kernel_init=he) for n in self.sizes]
-        self.read = nn.Dense(self.state, use_bias=False, param_dtype=self.dtype)
-        half = self.state // 2
-        self.nu = self.param("nu", lambda key: jnp.log(1 / 20 ** jax.random.uniform(key, (half,), self.dtype)))
-        self.angle = self.param("angle", lambda key: jax.random.uniform(key, (half,), self.dtype, 0, jnp.pi / 3))
-
-    def features(self, descriptor):
-        """What the recurrence reads, frame by frame."""
-        h = descriptor
-        for layer in self.per_joint:
-            h = nn.relu(layer(h))
-        h = h.reshape(*h.shape[:-2], -1)
-        for layer in self.joined:
-            h = nn.relu(layer(h))
-        size = jnp.exp(-jnp.exp(self.nu))
-        return self.read(h) * jnp.tile(jnp.sqrt(1 - size**2), 2)
-
-    def _turn(self, h):
-        size, half = jnp.exp(-jnp.exp(self.nu)), self.state // 2
-        real, imaginary = size * jnp.cos(self.angle), size * jnp.sin(self.angle)
-        a, b = h[..., :half], h[..., half:]
-        return jnp.concatenate([real * a - imaginary * b, imaginary * a + real * b], axis=-1)
-
-    def step(self, state, features):
-        """One step of the recurrence."""
-        return self._turn(state) + features
-
-    def states(self, features, state):
-        """All steps, time leading."""
-
-        def step(h, f):
-            h = self._turn(h) + f
-            return h, h
-
-        return lax.scan(step, state, features)[1]
-
-    def __call__(self, descriptors, state):
-        """Codes of a sequence, time leading, from a state."""
-        features = self.features(descriptors)
-        return self.step(state, features[0])[None] if self.is_initializing() else self.states(features, state)
-
-
-class WindowEncoder(nn.Module):
+class WindowEncoder(DynamicEncoder):
     """A sum over the last `TAPS` frames of what each gives by itself, without bias."""
 
-    joint_sizes: Sequence[int] = (32, 32)
-    sizes: Sequence[int] = (256, 256)
-    state: int = 256
-    dtype: DTypeLike = jnp.float32
+    def cell(self, dense: Callable[[int], nn.Module]) -> None:
+        """A linear map of those frames."""
+        self.taps = dense(self.state)
 
-    @nn.compact
-    def __call__(self, descriptors):
-        """Codes (frames, *batch, code) of descriptors, rest before the first."""
-        h = descriptors
-        for n in self.joint_sizes:
-            h = nn.relu(nn.Dense(n, use_bias=False, param_dtype=self.dtype, kernel_init=nn.initializers.he_normal())(h))
-        h = h.reshape(*h.shape[:-2], -1)
-        for n in self.sizes:
-            h = nn.relu(nn.Dense(n, use_bias=False, param_dtype=self.dtype, kernel_init=nn.initializers.he_normal())(h))
+    def __call__(self, descriptors: Array, state: Array | None = None) -> Array:
+        """Codes (frames, *batch, code) of descriptors, rest before the first; nothing is carried."""
+        h = self.by_frame(descriptors)
         padded = jnp.concatenate([jnp.zeros((TAPS - 1, *h.shape[1:]), h.dtype), h])
-        taps = jnp.concatenate([padded[k : k + len(h)] for k in range(TAPS)], axis=-1)
-        return nn.Dense(self.state, use_bias=False, param_dtype=self.dtype)(taps)
+        return self.taps(jnp.concatenate([padded[k : k + len(h)] for k in range(TAPS)], axis=-1))
 
 
 @dataclass(frozen=True)
@@ -183,22 +115,17 @@ def biased(ncs: Any, track: Track) -> Method:
 def windowed(ncs: Any, track: Track) -> Method:
     """With the window."""
     d, joints = ncs.dynamic, track.dynamic.shape[1:]
-    encoder: Any = WindowEncoder(d.joint_sizes, d.sizes, d.state, d.dtype)
+    encoder = WindowEncoder(d.joint_sizes, d.sizes, d.state, d.dtype)
     return Windowed(ncs.static, encoder, ncs.decoder, ncs.learn_weights, joints)
 
 
-def linear(ncs: Any, track: Track) -> Method:
-    """With the linear recurrence."""
-    d = ncs.dynamic
-    return replace(ncs, dynamic=LinearEncoder(d.joint_sizes, d.sizes, d.state, d.dtype))
-
-
-ARCHITECTURES: dict[str, Callable[[Any, Track], Method] | None] = {
-    "two codes, gated unit without bias": None,  # the scene's own
+# A cell that a scene file names, or a network that none does.
+ARCHITECTURES: dict[str, str | Callable[[Any, Track], Method]] = {
+    "two codes, gated unit without bias": "gated",
     "one code, gated unit": one_code,
     "with bias": biased,
     f"window of {TAPS} frames": windowed,
-    "linear, contracting": linear,
+    "linear, contracting": "linear",
 }
 
 
@@ -230,9 +157,12 @@ def rest(run: Run, motion: str) -> dict:
     }
 
 
-def measured(scene: Scene, altered: Callable | None, unseen: Sequence[str], steps: int, kept: Path) -> dict:
+def measured(scene: Scene, network: str | Callable, unseen: Sequence[str], steps: int, kept: Path) -> dict:
     """Train a network and measure it."""
-    run, minutes = trained(scene, steps, kept) if altered is None else fitted(scene, altered, steps)
+    if isinstance(network, str):
+        run, minutes = trained(changed(scene, network={"cell": network}), steps, kept)
+    else:
+        run, minutes = fitted(scene, network, steps)
     found = judged_on(run, unseen, [run.animate(motion) for motion in unseen], kept)
     return found | {"minutes": minutes} | rest(run, unseen[0])
 

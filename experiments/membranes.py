@@ -56,9 +56,9 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     forces = pressed(scene)
     scene = without(scene, unseen)
     scenes = {name: changed(scene, physics={"membrane": {"model": name}}) for name in MEMBRANES}
-    rows = networks(scenes, unseen[:1], steps, kept, "membrane")
-    rows = [row | limits(forces[row["membrane"]]) for row in rows]
-    write(out, "membranes", rows, {"membrane": "", **COLUMNS, **YIELDS})
+    rows = networks(scenes, unseen[:1], steps, kept, "model")
+    rows = [row | limits(forces[row["model"]]) for row in rows]
+    write(out, "membranes", rows, {"model": "", **COLUMNS, **YIELDS})
     with axes_of(out / "membranes.png", 1) as (axes,):
         for name, force in forces.items():
             axes.plot(LENGTHS, force, label=name)
@@ -72,9 +72,9 @@ def conclusion(rows: Sequence[dict]) -> str:
     """What the numbers say."""
 
     def told(row):
-        return f"{row['membrane']} {row['strain_mean']:.2f} % strain, {row['distance']:.1f} mm"
+        return f"{row['model']} {row['strain_mean']:.2f} % strain, {row['distance']:.1f} mm"
 
-    yields = [f"{r['membrane']} from {r['yields']:.2f}" for r in rows if isinstance(r["yields"], float)]
+    yields = [f"{r['model']} from {r['yields']:.2f}" for r in rows if isinstance(r["yields"], float)]
     end = f"pressed together, these give way: {', '.join(yields)} of their length" if yields else "pressed, none gives way"
     return f"Learned, to their own simulations: {'; '.join(map(told, rows))}; {end}."
 

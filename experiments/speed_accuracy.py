@@ -1,12 +1,13 @@
 """What does accuracy cost? Networks, smaller decoders, contact queries, meshes and simulations of one garment on one curve.
 
-    python -m experiments.speed_accuracy ncs:tshirt --minutes 4 --out runs/speed_accuracy
+    python -m experiments.speed_accuracy ncs:tshirt --out runs/speed_accuracy
 
-Every network is trained for the same time, every point in a process of its own, and judged on one motion (the scene's first
-validation motion, else its first) by the scene's own energies, against the simulation of its own garment: mean total energy
-above the simulation's in %, strain and penetration in %, millimetres to it, ms of a streamed frame, frames/s of the whole
-motion, peak memory in MB of the training or the simulation. Simulations have smooth contact, without which they do not
-converge. Writes speed_accuracy.csv, .md and .png. `--quick` is for trying it out: its numbers mean nothing.
+Every preset is trained for its own steps, all else for those of `balanced` unless its name says otherwise, every point in a
+process of its own. They are judged on one motion (the scene's first validation motion, else its first) by the scene's own
+energies, against the simulation of its own garment: mean total energy above the simulation's in %, strain and penetration in
+%, millimetres to it, ms of a streamed frame, frames/s of the whole motion, peak memory in MB of the training or the
+simulation. Simulations have smooth contact, without which they do not converge. Writes speed_accuracy.csv, .md and .png.
+`--quick` is for trying it out: its numbers mean nothing. An hour and a quarter on two cores.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measure import peak_memory
-from experiments.study import apart, changed, write
+from experiments.study import apart, axes_of, changed, write
 from ncs_jax import (
     InputError,
     Run,
@@ -52,6 +53,8 @@ COLUMNS = {
     "minutes": "training, min",
     "memory": "peak, MB",
 }
+# A network whose training takes as long as that of `accurate`, with half the steps.
+WIDER = {"static": (64, 128, 256, 512), "dynamic": (512, 512), "decoder": (512, 512, 512)}
 # Of every preset's decoder.
 SMALLER: dict[str, dict] = {
     "rank 64": {"rank": 64},
@@ -73,7 +76,7 @@ class Point:
 def points(scene: Scene, finer: str | None) -> list[Point]:
     """The points of the curve; those of a finer garment file, where there is one, come with its own simulation."""
 
-    def contact(**values):
+    def contact(scene, **values):
         return changed(scene, physics={"collision": values})
 
     def smooth(scene, **simulation):
@@ -86,8 +89,10 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
         Point("simulation, quasi-Newton, 9 iterations", smooth(scene, solver="quasi_newton", iterations=9), scene, True),
     ]
     result += [Point(name, changed(scene, **tables), scene) for name, tables in PRESETS.items()]
-    result += [Point("contact by triangles", contact(distance="triangle"), scene)]
-    result += [Point("contact by candidates", contact(search="candidates"), scene)]
+    scene = changed(scene, **PRESETS["balanced"])
+    result += [Point("512 wide, 7,500 steps", changed(scene, network=WIDER, training={"steps": 7500}), scene)]
+    result += [Point("contact by triangles", contact(scene, distance="triangle"), scene)]
+    result += [Point("contact by candidates", contact(scene, search="candidates"), scene)]
     if finer is not None:
         fine = changed(scene, garment={"file": finer})
         result += [Point("simulation, finer mesh", smooth(fine), fine, True), Point("finer mesh", fine, fine)]
@@ -106,10 +111,10 @@ def motion_of(scene: Scene) -> str:
     return (*scene.motion.validation, *scene.motion.files)[0]
 
 
-def trained(point: Point, minutes: float | None, steps: int | None) -> list[dict]:
+def trained(point: Point, steps: int | None) -> list[dict]:
     """Train a network and measure it, as it is and made smaller: rows with the vertices under "vertices"."""
     began = time.monotonic()
-    run = train(point.scene, minutes=minutes, steps=steps)
+    run = train(point.scene, steps=steps)
     taken, memory = (time.monotonic() - began) / 60, peak_memory() / 1e6
     name = motion_of(point.scene)
     rows = []
@@ -163,7 +168,7 @@ def streamed(run: Run, motion: str) -> float:
 
 
 def experiment(
-    scene: Scene, out: Path, *, finer=None, minutes: float | None = 4.0, steps: int | None = None, only: Sequence[str] = ()
+    scene: Scene, out: Path, *, finer: str | None = None, steps: int | None = None, only: Sequence[str] = ()
 ) -> list[dict]:
     """Measure every point, write the tables and the picture into `out`, and return the rows."""
     out.mkdir(parents=True, exist_ok=True)
@@ -171,7 +176,7 @@ def experiment(
     references: dict[str, dict] = {}  # by garment file
     wanted = [point for point in points(scene, finer) if not only or point.name in ("simulation", *only)]
     for point in wanted:
-        found = apart(simulated, point) if point.simulated else apart(trained, point, minutes, steps)
+        found = apart(simulated, point) if point.simulated else apart(trained, point, steps)
         reference = references.setdefault(point.scene.garment.file, found[0])
         for row in found:
             row["excess"] = 100 * (row["total"] - reference["total"]) / abs(reference["total"])
@@ -184,34 +189,42 @@ def experiment(
 
 
 def draw(path: Path, rows: list[dict]) -> None:
-    """Distance to the simulation and excess energy over the time of a frame; what nothing else beats is joined by a line."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    """Excess energy over the time of a frame and of the training, and distance to the simulation over the time of a frame."""
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import LogLocator
 
-    figure = Figure(figsize=(11, 4.5), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, key in zip(figure.subplots(1, 2), ("excess", "distance"), strict=True):
-        shown = sorted((row for row in rows if row[key] > 0), key=lambda row: row["frame"])
-        best = [row for i, row in enumerate(shown) if all(row[key] < other[key] for other in shown[:i])]
-        axes.plot([row["frame"] for row in best], [row[key] for row in best], color="0.7", zorder=0)
-        for row in shown:
-            style = "s" if "simulation" in row["point"] else "o"
-            preset = row["point"] in PRESETS
-            axes.plot(row["frame"], row[key], style, color="C3" if preset else "C0", markersize=7 if preset else 4)
-            axes.annotate(row["point"], (row["frame"], row[key]), fontsize=6, xytext=(4, 3), textcoords="offset points")
-        if shown:
-            axes.set(xscale="log", yscale="log")
-        axes.set(xlabel=COLUMNS["frame"], ylabel=COLUMNS[key])
-        axes.grid(alpha=0.3, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path)
+    families: dict[str, list[dict]] = {}
+    for row in rows:
+        if row["excess"] > 0:  # not the simulation itself
+            families.setdefault(row["point"].partition(", rank")[0].removesuffix(", bfloat16"), []).append(row)
+    shapes = dict(zip(SMALLER, "v^D", strict=True))
+    panels = (("frame", "excess"), ("minutes", "excess"), ("frame", "distance"))
+    with axes_of(path, len(panels) + 1, (3.4, 4.0)) as every:
+        for axes, (over, key) in zip(every, panels, strict=False):
+            for i, (name, family) in enumerate(families.items()):
+                for row in family:
+                    label = row["point"].removeprefix(f"{name}, ")
+                    shape = "s" if name.startswith("simulation") else shapes.get(label, "o")
+                    if over in row:
+                        axes.plot(row[over], row[key], shape, color=f"C{i % 10}", markersize=7 if label == name else 4)
+            axes.set(xlabel=COLUMNS[over], ylabel=COLUMNS[key], xscale="log", yscale="log" if key == "excess" else "linear")
+            for axis in (axes.xaxis, axes.yaxis)[: 2 if key == "excess" else 1]:
+                axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_formatter("")
+        legend = [
+            Line2D([], [], marker="s" if name.startswith("simulation") else "o", color=f"C{i % 10}", linestyle="", label=name)
+            for i, name in enumerate(families)
+        ]
+        legend += [Line2D([], [], marker=shape, color="0.5", linestyle="", label=name) for name, shape in shapes.items()]
+        every[-1].legend(handles=legend, loc="center left", frameon=False)
+        every[-1].axis("off")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
-    parser.add_argument("--minutes", type=float, default=4.0, help="of training, for every network (default: 4)")
     parser.add_argument("--finer", metavar="FILE", help="a finer mesh of the garment (default: the packaged one, where it is)")
     parser.add_argument("--only", nargs="+", default=(), metavar="POINT", help="these points, beside the simulation")
     parser.add_argument("--quick", action="store_true", help="20 steps of training")
@@ -220,8 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         scene = load_scene(options.scene)
         finer = options.finer or (f"{scene.garment.file}_fine" if scene.garment.file.startswith("ncs:") else None)
-        length = {"steps": 20, "minutes": None} if options.quick else {"minutes": options.minutes}
-        experiment(scene, Path(options.out), finer=finer, only=options.only, **length)
+        experiment(scene, Path(options.out), finer=finer, only=options.only, steps=20 if options.quick else None)
     except InputError as error:
         print(f"speed_accuracy: {error}", file=sys.stderr)
         return 2

@@ -9,15 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder, merge, recurrence
+from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder, merge, recurrence
 
 JOINTS, NUMBERS, STATE = 5, 12, 24
 every_dtype = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+every_cell = pytest.mark.parametrize("cell", [DynamicEncoder, LinearEncoder])
 
 
 @cache
-def encoder(dtype):
-    network = DynamicEncoder(joint_sizes=(8, 8), sizes=(16, 16), state=STATE, dtype=dtype)
+def encoder(dtype, cell=DynamicEncoder):
+    network = cell(joint_sizes=(8, 8), sizes=(16, 16), state=STATE, dtype=dtype)
     params = network.init(jax.random.key(0), jnp.zeros((1, JOINTS, NUMBERS), dtype), jnp.zeros(STATE, dtype))
     return network, params, jax.jit(network.apply)
 
@@ -35,16 +36,18 @@ def test_no_bias_anywhere_and_types_are_kept(dtype):
 
 
 @every_dtype
-def test_no_motion_is_exactly_no_code(dtype):
-    _, params, apply = encoder(dtype)
+@every_cell
+def test_no_motion_is_exactly_no_code(dtype, cell):
+    _, params, apply = encoder(dtype, cell)
     codes = apply(params, jnp.zeros((7, JOINTS, NUMBERS), dtype), jnp.zeros(STATE, dtype))
     assert codes.shape == (7, STATE) and codes.dtype == dtype
     np.testing.assert_array_equal(codes, 0)
 
 
 @every_dtype
-def test_rest_before_a_motion_changes_nothing(rng, dtype):
-    _, params, apply = encoder(dtype)
+@every_cell
+def test_rest_before_a_motion_changes_nothing(rng, dtype, cell):
+    _, params, apply = encoder(dtype, cell)
     moving = descriptors(rng, 9, dtype)
     rest = jnp.zeros((6, JOINTS, NUMBERS), dtype)
     start = jnp.zeros(STATE, dtype)
@@ -91,8 +94,9 @@ def test_when_motion_stops_the_code_decays(rng):
 
 
 @every_dtype
-def test_a_sequence_equals_its_steps(rng, dtype):
-    network, params, apply = encoder(dtype)
+@every_cell
+def test_a_sequence_equals_its_steps(rng, dtype, cell):
+    network, params, apply = encoder(dtype, cell)
     moving = descriptors(rng, 6, dtype)
     codes = apply(params, moving, jnp.zeros(STATE, dtype))
 
@@ -121,12 +125,37 @@ def test_step_is_a_gated_recurrent_unit(rng):
     np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
-def test_a_batch_is_its_members(rng):
-    _, params, apply = encoder(jnp.float64)
+@every_cell
+def test_a_batch_is_its_members(rng, cell):
+    _, params, apply = encoder(jnp.float64, cell)
     batch = jnp.asarray(rng.normal(size=(6, 3, JOINTS, NUMBERS)))
     codes = apply(params, batch, jnp.zeros((3, STATE)))
     for b in range(3):
         np.testing.assert_allclose(codes[:, b], apply(params, batch[:, b], jnp.zeros(STATE)), atol=1e-14)
+
+
+@every_dtype
+def test_a_linear_cell_cannot_grow(rng, dtype):
+    _, params, apply = encoder(dtype, LinearEncoder)
+    own = params["params"]
+    wild = {"params": own | {"nu": 10 * own["nu"], "angle": 100 * own["angle"]}}  # time constants up to 1e13 frames
+    state = jnp.asarray(rng.normal(size=STATE), dtype)
+    codes = apply(wild, jnp.zeros((1000, JOINTS, NUMBERS), dtype), state)
+    sizes = np.hypot(*np.split(np.concatenate([state[None], codes]).astype(float), 2, axis=1))
+    assert np.all(sizes[1:] <= sizes[:-1] * (1 + 1e-6)) and sizes[-1].max() > 0.1 * sizes[0].max() > sizes[-1].min()
+    moving = apply(wild, jnp.ones((1000, JOINTS, NUMBERS), dtype), state)
+    assert np.isfinite(moving).all() and np.abs(moving[500:]).max() < 1e3
+
+
+def test_step_of_a_linear_cell(rng):
+    network, params, _ = encoder(jnp.float64, LinearEncoder)
+    nu, angle = (np.asarray(params["params"][name]) for name in ("nu", "angle"))
+    h, f = rng.normal(size=STATE), rng.normal(size=STATE)
+    number = (
+        np.exp(-np.exp(nu) + 1j * angle) * (h[: STATE // 2] + 1j * h[STATE // 2 :]) + f[: STATE // 2] + 1j * f[STATE // 2 :]
+    )
+    got = network.apply(params, jnp.asarray(h), jnp.asarray(f), method="step")
+    np.testing.assert_allclose(got, np.concatenate([number.real, number.imag]), rtol=1e-12)
 
 
 @every_dtype

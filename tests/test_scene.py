@@ -38,17 +38,17 @@ def _lists(value):
 
 
 def test_a_preset_takes_the_place_of_the_scenes_own_values(tmp_path):
-    path = write(tmp_path, "[network]\ndecoder = [7]\nmodes = 3\njoint = [9]\n[training]\nbatch = 5\n")
+    path = write(tmp_path, "[network]\ndecoder = [7]\nmodes = 3\njoint = [9]\n[training]\nbatch = 5\nsteps = 9\n")
     for name, tables in PRESETS.items():
         scene = load_scene(path, name)
         assert scene.network.decoder == tables["network"]["decoder"] and scene.training.batch == 5
-        assert scene.network.joint == (9,)
+        assert scene.network.joint == (9,) and scene.training.steps == tables["training"]["steps"]
     assert load_scene(path).network.decoder == (7,)
     assert load_scene(write(tmp_path, ""), "balanced").to_dict() == Scene().to_dict()
     with pytest.raises(InputError, match="a table expected"):
         load_scene(write(tmp_path, "network = 3"), "fast")
-    sizes = [sum(PRESETS[name]["network"]["decoder"]) for name in ("fast", "balanced", "accurate")]
-    assert sizes == sorted(set(sizes))
+    costs = [sum(PRESETS[name]["network"]["decoder"]) * PRESETS[name]["training"]["steps"] for name in PRESETS]
+    assert list(PRESETS) == ["fast", "balanced", "accurate"] and costs == sorted(set(costs))
 
 
 def test_relative_paths_resolve_from_the_file(tmp_path):
@@ -70,6 +70,7 @@ def test_packaged_scenes_are_good(name):
         ('[physics]\ndensity = "heavy"', ["physics.density", "a number expected", "'heavy'"]),
         ("[physics]\ndensity = -1", ["physics.density", "from 0.0001", "-1"]),
         ("[physics]\ndensity = nan", ["physics.density", "nan"]),
+        ('[network]\ncell = "linear"\nstatic = [8, 7]', ["network.static", "[8, 7]", "even"]),
         ("[physics]\ngravity = [0, 9.81]", ["physics.gravity", "three numbers"]),
         ("[physics]\ngravity = 9.81", ["physics.gravity", "a list expected"]),
         ("[physics]\ninertia = 1", ["physics.inertia", "true or false"]),

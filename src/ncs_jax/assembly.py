@@ -21,7 +21,7 @@ from ncs_jax.methods.snug import SNUG
 from ncs_jax.model import Model, local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
 from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track, mirror, track
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder
 from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix, resample
 from ncs_jax.scene import Scene
@@ -302,7 +302,8 @@ def _network(scene: Scene, model: Model) -> Method:
     static = StaticEncoder(spec.static, dtype)
     if spec.method == "pbns":
         return PBNS(static, decoder, learned)
-    return NCS(static, DynamicEncoder(spec.joint, spec.dynamic, state, dtype) if model.moves else None, decoder, learned)
+    encoder = {"gated": DynamicEncoder, "linear": LinearEncoder}[spec.cell]
+    return NCS(static, encoder(spec.joint, spec.dynamic, state, dtype) if model.moves else None, decoder, learned)
 
 
 def _closure(joints, parents) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import flax.linen as nn
 import jax
@@ -13,7 +13,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-__all__ = ["Decoder", "DynamicEncoder", "StaticEncoder", "merge", "recurrence"]
+__all__ = ["Decoder", "DynamicEncoder", "LinearEncoder", "StaticEncoder", "merge", "recurrence"]
 
 
 class StaticEncoder(nn.Module):
@@ -118,18 +118,26 @@ class DynamicEncoder(nn.Module):
         he = nn.initializers.he_normal()
         self.per_joint = [dense(n, kernel_init=he) for n in self.joint_sizes]
         self.joined = [dense(n, kernel_init=he) for n in self.sizes]
+        self.cell(dense)
+
+    def cell(self, dense: Callable[[int], nn.Module]) -> None:
+        """Create what the recurrence needs."""
         self.gates_in = dense(3 * self.state)
         self.recurrent = self.param("recurrent", nn.initializers.orthogonal(), (self.state, 3 * self.state), self.dtype)
 
     def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch gates"]:
         """What the recurrence reads, frame by frame: everything that needs no state."""
+        return self.gates_in(self.by_frame(descriptor))
+
+    def by_frame(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch size"]:
+        """The layers of each joint by itself, then those of all."""
         h = descriptor
         for layer in self.per_joint:
             h = nn.relu(layer(h))
         h = h.reshape(*h.shape[:-2], -1)
         for layer in self.joined:
             h = nn.relu(layer(h))
-        return self.gates_in(h)
+        return h
 
     def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]) -> Float[Array, "*batch code"]:
         """One step of the gated recurrent unit."""
@@ -149,6 +157,44 @@ class DynamicEncoder(nn.Module):
     ) -> Float[Array, "frames *batch code"]:
         """Codes of a sequence from its features, time leading."""
         return recurrence(self.recurrent, features, state)
+
+
+class LinearEncoder(DynamicEncoder):
+    """With a diagonal linear recurrence h_t = lambda h_{t-1} + sqrt(1 - |lambda|^2) f_t, complex, in place of the gated unit.
+
+    |lambda| = exp(-exp(nu)) < 1 whatever is learned, so the state cannot grow: each number of it is a decaying oscillation,
+    the real parts first. Source: Orvieto et al. 2023, with no skip or normalisation.
+    """
+
+    def cell(self, dense: Callable[[int], nn.Module]) -> None:
+        """Time constants from 1 to 20 frames, periods from 6 frames on."""
+        half = self.state // 2
+        self.read = dense(2 * half)
+        self.nu = self.param("nu", lambda key: -jnp.log(20.0) * jax.random.uniform(key, (half,), self.dtype))
+        self.angle = self.param("angle", lambda key: jax.random.uniform(key, (half,), self.dtype, 0, jnp.pi / 3))
+
+    def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch code"]:
+        """What the recurrence adds, frame by frame: everything that needs no state."""
+        h = self.read(self.by_frame(descriptor))
+        return h * jnp.broadcast_to(jnp.tile(jnp.sqrt(-jnp.expm1(-2 * jnp.exp(self.nu))), 2), h.shape)
+
+    def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch code"]) -> Float[Array, "*batch code"]:
+        """One step of the recurrence."""
+        a, b = jnp.split(state, 2, axis=-1)
+        size = jnp.exp(-jnp.exp(self.nu))
+        real, imaginary = (jnp.broadcast_to(size * f(self.angle), a.shape) for f in (jnp.cos, jnp.sin))
+        return jnp.concatenate([real * a - imaginary * b, imaginary * a + real * b], axis=-1) + features
+
+    def states(
+        self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"]
+    ) -> Float[Array, "frames *batch code"]:
+        """Codes of a sequence from its features, time leading."""
+
+        def step(h, f):
+            h = self.step(h, f)
+            return h, h
+
+        return lax.scan(step, state, features)[1]
 
 
 @jax.custom_vjp

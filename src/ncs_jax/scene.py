@@ -147,6 +147,7 @@ class NetworkSpec:
     static: tuple[int, ...] = _f((64, 128, 256), "static encoder; snug has the last size", low=1, high=65536)
     joint: tuple[int, ...] = _f((32, 32), "dynamic encoder, each joint by itself", low=1, high=65536)
     dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints; snug's encoder", low=1, high=65536)
+    cell: str = _f("gated", "ncs's recurrence; linear: one that cannot grow", choices=("gated", "linear"))
     decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
     modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
 
@@ -155,7 +156,7 @@ class NetworkSpec:
 class TrainingSpec:
     """[training]."""
 
-    steps: int = _f(2000, "optimiser steps", low=1, high=10_000_000)
+    steps: int = _f(5000, "optimiser steps", low=1, high=10_000_000)
     batch: int = _f(32, "windows a step", low=1, high=65536)
     window: int = _f(11, "frames a window", low=1, high=10000)
     learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
@@ -212,9 +213,18 @@ class Scene:
 
 
 PRESETS: dict[str, dict] = {
-    "fast": {"network": {"static": (64, 128, 128), "dynamic": (128, 128), "decoder": (128, 128, 128), "modes": 64}},
-    "balanced": {"network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128}},
-    "accurate": {"network": {"static": (64, 128, 256, 512), "dynamic": (512, 512), "decoder": (512, 512, 512), "modes": 128}},
+    "fast": {
+        "network": {"static": (64, 128, 128), "dynamic": (128, 128), "decoder": (128, 128, 128), "modes": 64},
+        "training": {"steps": 2000},
+    },
+    "balanced": {
+        "network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128},
+        "training": {"steps": 5000},
+    },
+    "accurate": {
+        "network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128},
+        "training": {"steps": 15000},
+    },
 }  # what `ncs train --preset` puts in place of a scene's own values; experiments/speed_accuracy.py measures them
 
 
@@ -261,6 +271,8 @@ def scene_from(tables: dict, source: str = "") -> Scene:
     for name in ("static", "decoder"):
         if not getattr(scene.network, name):
             raise InputError("at least one layer expected", file=source, field=f"network.{name}", value=[])
+    if scene.network.cell == "linear" and scene.network.static[-1] % 2:
+        raise InputError("an even last size expected", file=source, field="network.static", value=list(scene.network.static))
     if scene.garment.file in ("", "none"):
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
     return dataclasses.replace(scene, source=source)
