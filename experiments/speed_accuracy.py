@@ -7,13 +7,15 @@ process of its own. They are judged on one motion (the scene's first validation 
 energies, against the simulation of its own garment: mean total energy above the simulation's in %, strain and penetration in
 %, millimetres to it, ms of a streamed frame, frames/s of the whole motion, peak memory in MB of the training or the
 simulation. Simulations have smooth contact, without which they do not converge. Writes speed_accuracy.csv, .md and .png.
-`--quick` is for trying it out: its numbers mean nothing. An hour and a quarter on two cores.
+What was measured is kept in the folder `points` beside them, so that a run that broke off goes on where it was; delete it to
+measure anew. `--quick` is for trying it out: its numbers mean nothing. An hour and a quarter on two cores.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import sys
 import time
 from collections.abc import Sequence
@@ -25,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measure import peak_memory
-from experiments.study import apart, axes_of, changed, write
+from experiments.study import apart, axes_of, changed, named, write
 from ncs_jax import (
     InputError,
     Run,
@@ -40,6 +42,7 @@ from ncs_jax import (
     train,
 )
 from ncs_jax.assembly import load_motion, track_of
+from ncs_jax.io.npz import write_npz
 from ncs_jax.scene import PRESETS
 
 COLUMNS = {
@@ -167,6 +170,18 @@ def streamed(run: Run, motion: str) -> float:
     return float(np.median(times[1:]))
 
 
+def measured(point: Point, steps: int | None, kept: Path) -> list[dict]:
+    """A point's rows, from a process of its own: measured once, and read from the folder after that."""
+    file = kept / f"{named(point.name, point.scene.to_dict(), steps)}.npz"
+    if not file.exists():
+        rows = apart(simulated, point) if point.simulated else apart(trained, point, steps)
+        vertices = np.stack([row.pop("vertices") for row in rows])
+        kept.mkdir(parents=True, exist_ok=True)
+        write_npz(file, vertices=vertices, rows=np.array(json.dumps(rows)))
+    with np.load(file, allow_pickle=False) as arrays:
+        return [row | {"vertices": x} for row, x in zip(json.loads(str(arrays["rows"])), arrays["vertices"], strict=True)]
+
+
 def experiment(
     scene: Scene, out: Path, *, finer: str | None = None, steps: int | None = None, only: Sequence[str] = ()
 ) -> list[dict]:
@@ -176,7 +191,7 @@ def experiment(
     references: dict[str, dict] = {}  # by garment file
     wanted = [point for point in points(scene, finer) if not only or point.name in ("simulation", *only)]
     for point in wanted:
-        found = apart(simulated, point) if point.simulated else apart(trained, point, steps)
+        found = measured(point, steps, out / "points")
         reference = references.setdefault(point.scene.garment.file, found[0])
         for row in found:
             row["excess"] = 100 * (row["total"] - reference["total"]) / abs(reference["total"])

@@ -59,7 +59,8 @@ def without(scene: Scene, unseen: Sequence[str]) -> Scene:
     return changed(scene, motion={"files": tuple(name for name in scene.motion.files if name not in unseen), "validation": ()})
 
 
-def _named(*told: Any) -> str:
+def named(*told: Any) -> str:
+    """A name of anything that JSON can tell, for a file."""
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -71,7 +72,7 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
     smooth = changed(scene, physics={"collision": {"distance": "smooth"}}, network={"modes": 0})
     tables = smooth.to_dict()
     told = [motion, scene.motion.fps, *(tables[name] for name in ("body", "garment", "physics", "simulation"))]
-    file = kept / "simulations" / f"{_named(told)}.npz"
+    file = kept / "simulations" / f"{named(told)}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_npz(file, vertices=simulate(smooth, motion).vertices)
@@ -81,7 +82,7 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
 
 def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
     """The scene's network after so many steps, and how many minutes they took: trained once, and read after that."""
-    folder = kept / "trained" / _named(scene.to_dict(), steps)
+    folder = kept / "trained" / named(scene.to_dict(), steps)
     run = train(scene, folder, steps=steps, resume=(folder / "run.json").exists())
     with (folder / "log.csv").open(newline="") as file:
         seconds = [float(row["seconds"]) for row in csv.DictReader(file)]

@@ -54,7 +54,8 @@ def test_fit_material(tmp_path, capsys):
 
 def test_speed_accuracy(tmp_path, capsys):
     out = tmp_path / "out"
-    assert speed_accuracy.main([str(write_scene(tmp_path)), "--quick", "--only", "fast", "--out", str(out)]) == 0
+    command = [str(write_scene(tmp_path)), "--quick", "--only", "fast", "--out", str(out)]
+    assert speed_accuracy.main(command) == 0
     with (out / "speed_accuracy.csv").open() as file:
         rows = {row["point"]: row for row in csv.DictReader(file)}
     assert set(rows) == {"simulation", "fast", "fast, rank 16", "fast, bfloat16"}
@@ -63,6 +64,10 @@ def test_speed_accuracy(tmp_path, capsys):
     assert all(50 < float(row["memory"]) < 2000 and float(row["frame"]) > 0 for row in rows.values())
     assert (out / "speed_accuracy.md").read_text().count("\n") == 2 + len(rows)
     assert (out / "speed_accuracy.png").read_bytes()[:4] == b"\x89PNG"
+    before = (out / "speed_accuracy.csv").read_text()
+    (out / "speed_accuracy.csv").unlink()
+    assert speed_accuracy.main(command) == 0  # nothing is measured twice
+    assert (out / "speed_accuracy.csv").read_text() == before
     assert speed_accuracy.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
