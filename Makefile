@@ -5,7 +5,7 @@ CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" 
 INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
 	$(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS))
 
-.PHONY: demo test test-all bench study lint format assets clean
+.PHONY: demo test test-all thorough bench study stability lint format assets clean
 
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
@@ -19,6 +19,10 @@ test: .venv/ready
 test-all: .venv/ready
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not gpu"
 
+# 10,000 cases of every property, and 1,000 damaged files of every reader. About half an hour.
+thorough: .venv/ready
+	NCS_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 tests/test_properties.py tests/test_io.py
+
 # Every benchmark on its packaged scene, or on SCENE: tables on the screen, figures in runs/bench. About a quarter of an hour.
 BENCHMARKS = training inference quality simulator growth
 bench: .venv/installed
@@ -29,6 +33,10 @@ bench: .venv/installed
 study: .venv/installed
 	rm -rf runs/study
 	$(BIN)/python -m experiments
+
+# Where energies, networks, simulator and training break: tables and pictures in experiments/results. About half an hour.
+stability: .venv/installed
+	$(BIN)/python -m experiments.stability
 
 lint: .venv/ready
 	$(BIN)/ruff check .

@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -194,10 +195,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("architecture", __doc__ or "", experiment, arguments)
-
+main = partial(command, "architecture", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

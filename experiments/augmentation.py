@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from experiments.study import COLUMNS, bars, changed, command, networks, without, write
@@ -41,10 +42,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     return f"Against none ({none['total']:.4f} J, {none['distance']:.1f} mm): " + "; ".join(map(told, others)) + "."
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("augmentation", __doc__ or "", experiment, arguments)
-
+main = partial(command, "augmentation", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from experiments.study import COLUMNS, apart, bars, changed, command, judged, networks, reference, trained, without, write
@@ -66,10 +67,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("budget", __doc__ or "", experiment, arguments)
-
+main = partial(command, "budget", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +64,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("control", __doc__ or "", experiment, arguments)
-
+main = partial(command, "control", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

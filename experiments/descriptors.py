@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -120,10 +121,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("descriptors", __doc__ or "", experiment, arguments)
-
+main = partial(command, "descriptors", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

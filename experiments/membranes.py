@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -79,10 +80,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     return f"Learned, to their own simulations: {'; '.join(map(told, rows))}; {end}."
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("membranes", __doc__ or "", experiment, arguments)
-
+main = partial(command, "membranes", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,10 +92,7 @@ def conclusion(rows: Sequence[dict]) -> str:
     return text + "."
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
-    return command("methods", __doc__ or "", experiment, arguments)
-
+main = partial(command, "methods", __doc__, experiment)
 
 if __name__ == "__main__":
     sys.exit(main())

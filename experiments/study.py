@@ -155,7 +155,7 @@ def write(out: Path, name: str, rows: Sequence[dict], columns: dict[str, str]) -
     (out / f"{name}.md").write_text("\n".join(lines) + "\n")
 
 
-def command(name: str, doc: str, experiment: Callable, arguments: Sequence[str] | None) -> int:
+def command(name: str, doc: str | None, experiment: Callable, arguments: Sequence[str] | None = None) -> int:
     """Run an experiment(scene, unseen, steps, out, kept) from the command line, and show its table."""
     parser = argparse.ArgumentParser(prog=name, description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")

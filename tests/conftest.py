@@ -25,6 +25,9 @@ ARRAYS += ["model", "motion", "methods", "rollout"]
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int is good where a float is
 install_import_hook([f"ncs_jax.{name}" for name in ARRAYS], CHECKER)
 
+# `make thorough`: as many cases of every property and of every damaged file as a release is to withstand.
+THOROUGH = bool(os.environ.get("NCS_THOROUGH"))
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 

@@ -17,6 +17,7 @@ from experiments import (
     methods,
     seeds,
     speed_accuracy,
+    stability,
     study,
 )
 
@@ -172,3 +173,15 @@ def test_falling(tmp_path, capsys):
         rows = {(row["case"], row["inertia"]): row for row in csv.DictReader(file)}
     assert len(rows) == 6 and (tmp_path / "falling.png").read_bytes()[:4] == b"\x89PNG"
     assert float(rows["free fall", "simulation"]["mean"]) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.slow  # nearly all of it is compiling, in two precisions
+def test_stability(tmp_path, capsys):
+    assert stability.main([str(write_scene(tmp_path)), "--quick", "--out", str(tmp_path / "out")]) == 0
+    for part in stability.PARTS:
+        with (tmp_path / "out" / f"stability_{part}_cells.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        assert {row["state"] for row in rows} <= set(stability.STATES) and any(row["state"] == "safe" for row in rows)
+        assert (tmp_path / "out" / f"stability_{part}.png").read_bytes()[:4] == b"\x89PNG"
+    assert "training" in capsys.readouterr().out
+    assert stability.main([str(tmp_path / "nowhere.toml")]) == 2

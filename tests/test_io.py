@@ -12,6 +12,8 @@ import struct
 import subprocess
 import sys
 import textwrap
+import time
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -22,6 +24,8 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io.bvh import read_bvh
+from ncs_jax.scene import load_scene, template
+from tests.conftest import THOROUGH
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 ASSETS = Path(io.__file__).parents[1] / "assets"
@@ -708,23 +712,61 @@ def flipped_inside(fields: dict, rng: random.Random) -> bytes:
     return zipped(**members | {chosen: flipped(members[chosen], rng)})
 
 
-@pytest.mark.parametrize("kind", ["zip", "body", "garment", "motion", "animation", "obj", "bvh", "pc2"])
+def meshes(suffix: str) -> bytes:
+    import trimesh
+
+    data = trimesh.Trimesh(*STRIP, process=False).export(file_type=suffix)
+    return data if isinstance(data, bytes) else str(data).encode()
+
+
+def hdf5_bytes(fields: dict) -> bytes:
+    import h5py
+
+    out = bytes_io.BytesIO()
+    with h5py.File(out, "w") as file:
+        for name, value in fields.items():
+            file[name] = np.asarray(value).astype("S") if np.asarray(value).dtype.kind == "U" else value
+    return out.getvalue()
+
+
+# kind: reader, suffix, and a sound file's bytes; None: an .npz of which one array is damaged
+READERS = {
+    "zip": (io.read_motion, "npz", lambda: npz_bytes(motion())),
+    "body": (io.read_body, "npz", None),
+    "garment": (io.read_garment, "npz", None),
+    "motion": (io.read_motion, "npz", None),
+    "animation": (io.read_animation, "npz", None),
+    "hdf5 motion": (io.read_motion, "h5", lambda: hdf5_bytes(motion())),
+    "hdf5 animation": (io.read_animation, "h5", lambda: hdf5_bytes(animation())),
+    "obj": (io.read_garment, "obj", lambda: OBJ.encode()),
+    "ply": (io.read_garment, "ply", lambda: meshes("ply")),
+    "stl": (io.read_garment, "stl", lambda: meshes("stl")),
+    "glb": (io.read_garment, "glb", lambda: meshes("glb")),
+    "bvh": (io.read_motion, "bvh", lambda: BVH.encode()),
+    "pc2": (io.read_animation, "pc2", lambda: PC2),
+    "scene": (load_scene, "toml", lambda: template().encode()),
+}
+FIELDS = {"body": body, "garment": garment, "motion": motion, "animation": animation}
+
+
+@pytest.mark.parametrize("kind", READERS)
 def test_random_damage_is_read_or_refused(tmp_path, kind):
-    rng = random.Random(kind)
-    refused = 0
-    for case in range(50):
-        suffix = kind if kind in ("obj", "bvh", "pc2") else "npz"
+    rng, (read, suffix, sound) = random.Random(kind), READERS[kind]
+    refused, whole = 0, None if sound is None else sound()
+    tracemalloc.start()
+    for case in range(1000 if THOROUGH else 50):
         path = tmp_path / f"{case}.{suffix}"
-        fields = {"body": body(), "garment": garment(), "animation": animation()}.get(kind, motion())
-        texts = {"obj": OBJ.encode(), "bvh": BVH.encode(), "pc2": PC2, "zip": npz_bytes(fields)}
-        path.write_bytes(flipped(texts[kind], rng) if kind in texts else flipped_inside(fields, rng))
-        read = {"body": io.read_body, "garment": io.read_garment, "obj": io.read_garment}.get(kind, io.read_motion)
+        path.write_bytes(flipped_inside(FIELDS[kind](), rng) if whole is None else flipped(whole, rng))
+        before, began = path.read_bytes(), time.monotonic()
         try:
-            (io.read_animation if kind in ("animation", "pc2") else read)(path)
+            read(path)
         except InputError as error:
             refused += 1
             assert str(path) in str(error) and "\n" not in str(error)
-    assert refused > 5
+        assert time.monotonic() - began < 10 and path.read_bytes() == before
+        path.unlink()
+    assert refused > 5 and tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
 
 
 # --- real files -------------------------------------------------------------------------------------------------------------

@@ -11,11 +11,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.assembly import assemble, track_of
+from ncs_jax.dynamics import dynamics
+from ncs_jax.evaluation import measure
 from ncs_jax.io import MotionRecord
 from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, transforms
+from ncs_jax.methods.shared import initial_parameters
 from ncs_jax.motion import input_joints, mirror, track
+from ncs_jax.rollout import animate
 from ncs_jax.rotations import axis_angle_to_matrix
 from ncs_jax.scene import load_scene
+from ncs_jax.simulator import simulate, simulator_from
 
 from .scenes import write_scene
 
@@ -170,3 +175,50 @@ def test_the_network_reads_its_input_joints_in_order(tmp_path, rng, inputs):
         np.testing.assert_array_equal(getattr(joints, name), np.asarray(source)[list(inputs)])
     start = jnp.zeros(3, jnp.int32)
     assert track(model, local, jnp.asarray(record.translation), start).static.shape == (3, len(inputs), 9)
+
+
+# --- far from the origin ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wearer(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("far")
+    a = assemble(load_scene(write_scene(folder)))
+    record = a.motions[a.scene.motion.files[0]]
+    return a, dataclasses.replace(record, translation=record.translation.astype(np.float64))
+
+
+def elsewhere(record, way):
+    return dataclasses.replace(record, translation=record.translation + np.asarray(way))
+
+
+def test_near_the_origin_nothing_is_shifted(wearer):
+    a, record = wearer
+    assert track_of(a.model, record).origin is None
+
+
+@pytest.mark.parametrize("way", [(1e4, 0.0, 0.0), (-6e3, 2e3, 7e3)])
+def test_far_from_the_origin_is_as_fine_as_near(wearer, way):
+    a, record = wearer
+    here, there = track_of(a.model, record), track_of(a.model, elsewhere(record, way))
+    for name in ("static", "dynamic", "matrices"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(there.origin, np.tile(way, (len(record.poses), 1)))
+
+
+def test_what_is_far_is_animated_measured_and_simulated_there(wearer):
+    a, record = wearer
+    way = np.array([8e3, 0.0, -1.6e3])
+    here, there = track_of(a.model, record), track_of(a.model, elsewhere(record, way))
+    params = initial_parameters(a.network, jax.random.PRNGKey(0), a.model)
+    x, far = (np.asarray(animate(a.model, a.network, params, t), np.float64) for t in (here, there))
+    np.testing.assert_allclose(far - way, x, rtol=0, atol=1e-3)  # what float32 tells apart 8 km away
+    rows, others = measure(a.model, x.astype(np.float32), here), measure(a.model, x + way, there)
+    for name, values in rows.items():
+        np.testing.assert_allclose(others[name], values, rtol=1e-3, atol=1e-6)
+    moving = [dynamics(a.model, v, t) for v, t in ((x, here), (x + way, there))]
+    for name, value in moving[0].items():
+        assert moving[1][name] == pytest.approx(value, rel=1e-3, abs=1e-3)
+    short = [jax.tree.map(lambda v: v[:3], t) for t in (here, there)]
+    near, away = (np.asarray(simulate(simulator_from(a.model), t)[0], np.float64) for t in short)
+    np.testing.assert_allclose(away - way, near, rtol=0, atol=1e-3)

@@ -28,6 +28,8 @@ from ncs_jax.scene import Scene
 
 __all__ = ["Assembly", "Prepared", "assemble", "load_motion", "mirror_partners", "track_of"]
 
+CELL = 8.0  # m
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -83,9 +85,11 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         )  # fmt: skip
     translation = record.translation
     if record.fps != scene.motion.fps:
-        poses, translation = resample(
-            jnp.asarray(poses, jnp.float32), jnp.asarray(translation, jnp.float32), float(record.fps), scene.motion.fps
+        begin = translation[:1].astype(np.float64)
+        poses, moved = resample(
+            jnp.asarray(poses, jnp.float32), jnp.asarray(translation - begin, jnp.float32), float(record.fps), scene.motion.fps
         )
+        translation = begin + np.asarray(moved)
     return io.MotionRecord(np.asarray(poses), np.asarray(translation), scene.motion.fps, record.joint_names)
 
 
@@ -285,13 +289,18 @@ def _training_track(scene, model: Model, body, records: list[io.MotionRecord]) -
 
 
 def track_of(model: Model, *records: io.MotionRecord) -> Track:
-    """Descriptors and transforms of motions that are at the model's frame rate, end to end."""
+    """Descriptors and transforms of motions that are at the model's frame rate, end to end.
+
+    Each is measured from the nearest corner, to where it begins, of a grid of `CELL` m.
+    """
     dtype = model.skeleton.joints.dtype
     lengths = [len(r.poses) for r in records]
     start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
     poses = jnp.asarray(np.concatenate([r.poses for r in records]).astype(dtype))
-    translation = jnp.asarray(np.concatenate([r.translation for r in records]).astype(dtype))
-    return track(model, local_rotations(model, poses), translation, jnp.asarray(start, jnp.int32))
+    origins = [CELL * np.round(r.translation[0].astype(np.float64) / CELL) for r in records]
+    near = np.concatenate([r.translation - origin for r, origin in zip(records, origins, strict=True)])
+    found = track(model, local_rotations(model, poses), jnp.asarray(near.astype(dtype)), jnp.asarray(start, jnp.int32))
+    return replace(found, origin=jnp.asarray(np.repeat(origins, lengths, axis=0), dtype)) if np.any(origins) else found
 
 
 def _network(scene: Scene, model: Model) -> Method:

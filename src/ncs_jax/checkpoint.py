@@ -14,7 +14,6 @@ import dataclasses
 import json
 import os
 import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 
 from ncs_jax.assembly import Prepared
 from ncs_jax.errors import InputError
+from ncs_jax.io.npz import read_npz
 
 __all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
 
@@ -86,12 +86,13 @@ def read_prepared(run: Path) -> Prepared:
     Raises:
         InputError: it is missing or damaged.
     """
+    names = [f.name for f in dataclasses.fields(Prepared)]
     path = Path(run) / "prepared.npz"
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return Prepared(**{f.name: data[f.name] for f in dataclasses.fields(Prepared)})
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"cannot be read: {error}", file=path, mend="train again into a new folder") from None
+        table = read_npz(path, names.__contains__)
+        return Prepared(**{name: table.array(name) for name in names})
+    except InputError as error:
+        raise InputError(error.expected, file=path, field=error.field, mend="train again into a new folder") from None
 
 
 class Checkpoints:

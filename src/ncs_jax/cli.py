@@ -425,6 +425,7 @@ def _evaluate(options) -> int:
 
 def _check(options) -> int:
     from ncs_jax.assembly import assemble
+    from ncs_jax.grading import findings
     from ncs_jax.scene import template
 
     if options.fields:
@@ -452,20 +453,12 @@ def _check(options) -> int:
             print(f"  {kind:9} {name}: {len(assembly.motions[name].poses)} frames at {model.fps:g} per second")
     if not model.moves:
         print("  the character never moves: only the static network is trained")
-    if model.surface is not None:
-        clearance = _clearance(model)
-        if clearance < 0:
-            print(f"  warning   the rest garment is up to {-1000 * clearance:.1f} mm inside the body: push it out")
+    found = findings(assembly)
+    for finding in found:
+        print(f"  at risk   {finding.what}: {finding.value}: {finding.risk}; {finding.mend}")
+    if not found:
+        print("  safe      material, mesh, fit and motions are inside the ranges of the stability map")
     return 0
-
-
-def _clearance(model) -> float:
-    """Least signed distance of the rest garment to the resting body, m."""
-    from ncs_jax.energies.collision import nearest_triangle, triangle_distance
-
-    x = model.garment.mesh.rest
-    index, _ = nearest_triangle(x, model.body, model.surface)
-    return float(triangle_distance(x, model.body, model.surface, index).min())
 
 
 if __name__ == "__main__":

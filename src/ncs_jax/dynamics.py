@@ -41,7 +41,7 @@ def _unposed(model: Model, vertices, matrices):
 
 def unposed(model: Model, vertices, track: Track) -> Float[np.ndarray, "frames verts 3"]:
     """The garment as seen from the body: the inverse of each vertex's blended transform applied to it, m."""
-    return np.asarray(_unposed(model, jnp.asarray(vertices, model.basis.dtype), track.matrices))
+    return np.asarray(_unposed(model, jnp.asarray(track.relative(vertices), model.basis.dtype), track.matrices))
 
 
 @jax.jit
@@ -117,7 +117,7 @@ def dynamics(model: Model, vertices, track: Track) -> dict[str, float]:
     """
     u, low, fps = unposed(model, vertices, track), hem(model), model.fps
     carried = np.asarray(_carried(model, track.matrices), np.float64)[:, low].mean(axis=1)
-    path = np.asarray(vertices, np.float64)[:, low].mean(axis=1)
+    path = track.relative(vertices).astype(np.float64)[:, low].mean(axis=1)
     found = {"speed": _speed(u, track, fps), "lag": _lag(path, carried, fps)}
     after = [_after(u[first - 1 : last, low].astype(np.float64).mean(axis=1), fps) for first, last in stops(track, fps)]
     if after:

@@ -119,10 +119,11 @@ def measure(
         exact: penetration by the exact signed distance to the body's triangles; else by the scene's own query, which is faster.
         self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
 
-    Energies use the scene's own terms. Before its first frame the garment is taken to have been at rest.
+    Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
+    taken to have been at rest.
     """
     frames = len(vertices)
-    positions = np.asarray(vertices)
+    positions = track.relative(np.asarray(vertices)).astype(model.basis.dtype, copy=False)
     groups = None
     if model.terms.self_contact if self_contact is None else self_contact:
         groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups

@@ -23,6 +23,8 @@ class Track:
     """Motions laid end to end. `start` is the first frame of the motion that a frame belongs to.
 
     Before its first frame a character is taken to have stood there at rest. `bodies` are what `training.with_bodies` adds.
+    A motion that begins far from the world's origin is measured from an `origin` of its own, so that single precision is as
+    fine there as here; None: all are measured from the world's.
     """
 
     static: Float[Array, "frames joints numbers"]
@@ -30,6 +32,15 @@ class Track:
     matrices: Float[Array, "frames all 3 4"]
     start: Int[Array, "frames"]
     bodies: Float[Array, "frames body 6"] | None = None  # positions in m and normals of the touchable body
+    origin: Float[Array, "frames 3"] | None = None  # m
+
+    def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
+        """Positions measured from the track's origin, in the world, m."""
+        return x if self.origin is None else x + self.origin[:, None]
+
+    def relative(self, x: Float[Array | np.ndarray, "frames verts 3"]) -> np.ndarray:
+        """The other way round, of any array, as NumPy."""
+        return np.asarray(x) if self.origin is None else np.asarray(x) - np.asarray(self.origin)[: len(x), None]
 
 
 def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joints:

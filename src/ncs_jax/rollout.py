@@ -19,7 +19,7 @@ from ncs_jax.methods.shared import Method, decode, for_inference, garment_blend
 from ncs_jax.model import Model
 from ncs_jax.motion import Track, input_joints
 
-__all__ = ["Rollout", "State", "animate", "stepper"]
+__all__ = ["Rollout", "State", "animate", "first_broken", "stepper"]
 
 BLOCK = 32  # garments decoded and skinned together
 
@@ -114,4 +114,25 @@ def animate(
             dynamic (alpha = 0 gives the same vertices).
     """
     z = network.codes(params, track).together(alpha)
-    return _posed(model, network, params, garment_blend(network, params, model), track.matrices, z)
+    return track.absolute(_posed(model, network, params, garment_blend(network, params, model), track.matrices, z))
+
+
+def first_broken(model: Model, network: Method, params: dict, track: Track, alpha: float = 1.0) -> str:
+    """Of a motion whose vertices are not all finite: the first frame of which something is not, what, and its vertex."""
+    codes = network.codes(params, track)
+    x = animate(model, network, params, track, alpha)
+    stages = {
+        "joint transforms": track.matrices,
+        "static descriptors": track.static,
+        "dynamic descriptors": track.dynamic,
+        "static code": codes.static,
+        "dynamic code": codes.dynamic,
+        "vertices": x,
+    }
+    broken = {name: ~np.isfinite(np.asarray(a)) for name, a in stages.items() if a is not None}
+    first = {name: int(bad.reshape(len(bad), -1).any(axis=1).argmax()) for name, bad in broken.items() if bad.any()}
+    if not first:
+        return "none"
+    name = min(first, key=lambda n: first[n])  # of those in one frame what comes first
+    entry = np.argwhere(broken[name][first[name]])[0][0]
+    return f"frame {first[name]}, {name}, entry {entry}"

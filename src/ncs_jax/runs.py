@@ -25,7 +25,7 @@ from ncs_jax.devices import batch_mesh, compiled, copied, divided, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
-from ncs_jax.rollout import animate
+from ncs_jax.rollout import animate, first_broken
 from ncs_jax.scene import Scene, load_scene, scene_from
 from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, glance, initial_state, with_bodies
 
@@ -76,12 +76,24 @@ class Run:
         return load_motion(a.scene, name if known else str(Path(name).absolute()), a.body)
 
     def animate(self, motion: str | Track, alpha: float = 1.0) -> np.ndarray:
-        """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves."""
+        """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
+
+        Raises:
+            InputError: a vertex is not finite: where, and what was so first.
+        """
         track = self.track(motion) if isinstance(motion, str) else motion
         frames = track.start.shape[0]
         # The last frame is repeated up to a whole number of blocks: motions of many lengths share a compilation.
         padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % BLOCK)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
-        return np.asarray(_animate(self.assembly.model, self.assembly.network, self.params, padded, float(alpha)))[:frames]
+        a = self.assembly
+        x = np.asarray(_animate(a.model, a.network, self.params, padded, float(alpha)))[:frames]
+        if not np.isfinite(np.sum(x)):
+            what = motion if isinstance(motion, str) else "a track"
+            broken = first_broken(a.model, a.network, self.params, track, float(alpha))
+            raise InputError(
+                "finite vertices expected", file=what, field=broken, value=f"alpha {alpha:g}", mend="see ncs check"
+            )
+        return x
 
     def compressed(self, motion: str | Track, *, rank: int = 0, bfloat16: bool = False) -> Run:
         """This garment with a smaller decoder, made for what it does in a motion: see `compression.compress`."""

@@ -93,7 +93,8 @@ def simulate(
     assembly = assemble(lone, dtype=dtype)
     model = assembly.model
     records = [] if name is None else [load_motion(lone, name, assembly.body)]
-    matrices = (track_of(model, *records) if records else assembly.track).matrices
+    track = track_of(model, *records) if records else assembly.track
+    matrices = track.matrices
     settings = Settings(
         spec.solver, spec.tolerance or None, spec.iterations, inertia=scene.physics.inertia, exact_pins=spec.pins == "exact"
     )
@@ -133,6 +134,8 @@ def simulate(
             write_npz(partial, **_kept(state), identity=np.asarray(identity), **arrays)
             saved = time.monotonic()
     arrays = {key: np.asarray(values) for key, values in rows.items()}
+    shown = jax.tree.map(lambda a: a[:: spec.substeps], track)
+    arrays["vertices"] = np.asarray(shown.absolute(jnp.asarray(arrays["vertices"])))
     return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
 
 

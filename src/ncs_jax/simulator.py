@@ -168,7 +168,8 @@ def simulate(
 
     Args:
         simulator: from `simulator_from`. track: of one motion, from `motion.track`. settings: tolerance and iterations.
-        state: to go on from; else the motion begins at rest. forces: external ones (frames, verts, 3) in N.
+        state: to go on from, measured from the track's origin; else the motion begins at rest. forces: external ones (frames,
+            verts, 3) in N.
 
     It may be differentiated in reverse with respect to the simulator's material and rest state, the track's transforms, the
     state and the forces: by the implicit function theorem, so memory grows with frames and not with iterations.
@@ -179,5 +180,5 @@ def simulate(
         state, x = simulation.follow(state, *inputs)
         return state, (x, state.solution)
 
-    _, result = lax.scan(frame, simulation.init() if state is None else state, (track.matrices, forces))
-    return result
+    _, (x, solution) = lax.scan(frame, simulation.init() if state is None else state, (track.matrices, forces))
+    return track.absolute(x), solution

@@ -1,0 +1,196 @@
+"""A garment in the midst of a motion, made ill along one axis after another or in one shape, and what energies say of it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import Scene, assemble
+from ncs_jax.energies.collision import surface_from
+from ncs_jax.energies.proximity import groups_from
+from ncs_jax.kinematics import blend, skin
+from ncs_jax.mesh import mesh_from
+from ncs_jax.model import pose_body
+from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, energies, pressure
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A garment in the midst of a motion, in float64, in metres and seconds."""
+
+    rest: np.ndarray
+    faces: np.ndarray
+    pins: np.ndarray
+    three: np.ndarray  # (3, verts, 3): now, and the two frames before
+    carried: np.ndarray
+    blended: np.ndarray  # (verts, 3, 4)
+    body: np.ndarray
+    body_faces: np.ndarray
+    along: np.ndarray
+    material: Material
+    membranes: dict[str, tuple[float, ...]]
+    dt: float
+
+
+ALONE = Terms(None, bending=False, collision=None, gravity=False, inertia=False)
+TERMS: dict[str, Terms] = {
+    **{name: replace(ALONE, membrane=name) for name in MEMBRANES},
+    "bending": replace(ALONE, bending=True),
+    **{f"collision, {name}": replace(ALONE, collision=name) for name in ("plane", "smooth", "triangle")},
+    "friction": replace(ALONE, friction=True),
+    "gravity": replace(ALONE, gravity=True),
+    "inertia": replace(ALONE, inertia=True),
+    "pinning": replace(ALONE, pinning=True),
+    "self-contact": replace(ALONE, self_contact=True),
+}
+
+
+def specimen(scene: Scene) -> Specimen:
+    """The scene's garment on its first motion, draped at random: 1 cm of its smooth modes and 0.2 mm of every vertex."""
+    a, rng = assemble(scene), np.random.default_rng(0)
+    m, frame = a.model, len(a.track.start) // 2
+    rest, modes = np.asarray(m.garment.mesh.rest, np.float64), np.asarray(m.basis, np.float64)
+    modes = modes / np.sqrt(np.mean(modes**2))
+    drape = modes[:, :12] @ rng.standard_normal((12, 3)) * 0.003
+
+    def posed(t: int, offset: np.ndarray) -> np.ndarray:
+        return np.asarray(skin(blend(a.track.matrices[t], m.blend), jnp.asarray(rest + offset, jnp.float32)), np.float64)
+
+    three = np.stack([posed(frame - k, (1 - 0.1 * k) * drape + 2e-4 * rng.standard_normal(rest.shape)) for k in range(3)])
+    physics = scene.physics
+    material = replace(m.material, friction=jnp.float32(0.5), self_contact=jnp.float32(1.0), self_thickness=jnp.float32(0.003))
+    return Specimen(
+        rest, np.asarray(m.garment.mesh.faces), np.arange(0, len(rest), 50), three, posed(frame, 0.9 * drape),
+        np.asarray(blend(a.track.matrices[frame], m.blend), np.float64),
+        np.asarray(pose_body(m, a.track.matrices[frame]), np.float64), np.asarray(m.surface.faces),
+        rng.standard_normal(rest.shape), material,
+        {name: tuple(getattr(physics.membrane, k) for k in keys) for name, (_, keys) in MEMBRANES.items()}, 1 / m.fps,
+    )  # fmt: skip
+
+
+def scaled(material: Material, factor: float, *names: str) -> Material:
+    """Some of its numbers times a factor."""
+    return replace(material, **{name: getattr(material, name) * np.float32(factor) for name in names})
+
+
+def along_axis(s: Specimen, axis: str, value: float) -> Specimen:
+    """The specimen at a value of one of the axes of `stability.PHYSICS`."""
+    if axis.startswith("time"):
+        return replace(s, dt=value)
+    if axis.startswith("stiffness"):
+        material = scaled(s.material, value, "bending", "collision", "friction", "pinning", "self_contact")
+        return replace(s, material=material, membranes={k: tuple(value * n for n in v) for k, v in s.membranes.items()})
+    if axis.startswith("density"):
+        return replace(s, material=replace(s.material, density=jnp.float32(value)))
+    if axis.startswith("gravity"):
+        return replace(s, material=scaled(s.material, value, "gravity"))
+    moved = s.blended.copy()
+    if axis.startswith("size"):
+        moved[..., 3] *= value
+        lengths = {name: value * getattr(s, name) for name in ("rest", "three", "carried", "body")}
+        return replace(s, blended=moved, material=scaled(s.material, value, "thickness", "self_thickness"), **lengths)
+    away = value * np.array([0.6, 0.64, 0.48])
+    moved[..., 3] += away
+    return replace(s, blended=moved, **{name: getattr(s, name) + away for name in ("three", "carried", "body")})
+
+
+def shapes(s: Specimen) -> Iterator[tuple[str, Specimen]]:
+    """What a mesh may look like at its worst. Singular faces are every hundredth one, so that they have sound neighbours."""
+    x, some = s.three[0], s.faces[::100]
+    a, b, c = some.T
+
+    def now(name: str, x: np.ndarray):
+        return name, replace(s, three=np.stack([x, *s.three[1:]]))
+
+    def with_corner(corner: np.ndarray, x: np.ndarray = x) -> np.ndarray:
+        x = x.copy()
+        x[c] = corner
+        return x
+
+    def towards_edge(x: np.ndarray, height: float) -> np.ndarray:
+        middle = (x[a] + x[b]) / 2
+        return with_corner(middle + height * (x[c] - middle), x)
+
+    yield "as worn", s
+    yield now("at rest", s.rest)
+    yield now("stretched 100 times", 100 * x)
+    yield now("compressed to 1 %", 0.01 * x)
+    yield now("all in one point", np.broadcast_to(x[:1], x.shape))
+    yield now("flat", x * [1, 1, 0])
+    yield now("mirrored", x * [1, 1, -1])
+    yield now("faces turned inside out", towards_edge(x, -1.0))
+    yield now("faces of no area", towards_edge(x, 0.0))
+    yield now("corners that coincide", with_corner(x[a]))
+    for height in (1e-2, 1e-4, 1e-6, 0.0):
+        yield f"needles at rest, {height:g}", replace(s, rest=towards_edge(s.rest, height), three=s.three)
+    yield "vertices that coincide at rest", replace(s, rest=with_corner(s.rest[a], s.rest))
+    hinge = first_hinge(s.faces)
+    for angle in (0.0, 90.0, 180.0):
+        folded = x.copy()
+        turn = np.radians(angle)
+        other = [-np.cos(turn).round(12), 0, np.sin(turn).round(12)]
+        folded[hinge] = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], other]) / 128 + x[hinge[0]].round(2)
+        yield now(f"folded by {angle:g} degrees", folded)
+    near = s.body[np.linspace(0, len(s.body) - 1, len(x)).astype(int)]
+    yield now("on the body's vertices", near)
+    corners = s.body[s.body_faces[np.linspace(0, len(s.body_faces) - 1, len(x)).astype(int)]]
+    yield now("on the body's edges", corners[:, :2].mean(axis=1))
+    yield now("on the body's faces", corners.mean(axis=1))
+    yield now("inside a limb", np.broadcast_to(s.body.mean(axis=0), x.shape) + 1e-3 * s.along)
+    yield now("as far from every limb", x + np.array([0.0, 0.0, 100.0]))
+    flat_body = s.body.copy()
+    flat_body[s.body_faces[::50, 2]] = flat_body[s.body_faces[::50, 0]]
+    yield "body with collapsed faces", replace(s, body=flat_body)
+
+
+def first_hinge(faces: np.ndarray) -> np.ndarray:
+    """Edge a-b and the corners opposite of the first two faces that share one: (4,)."""
+    a, b, c = faces[0]
+    for face in faces[1:]:
+        if a in face and b in face:
+            return np.array([a, b, c, next(v for v in face if v not in (a, b))])
+    raise ValueError("the first edge has but one face")
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def derivatives(terms: Terms, x, along, garment, material, frame, surface):
+    """Value, gradient and second derivative along a direction."""
+
+    def value(x):
+        return sum(energies(x, garment, material, frame, terms, surface).values())
+
+    slope, second = jax.jvp(jax.grad(value), (x,), (along,))
+    return value(x), slope, second
+
+
+def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]:
+    """Every term of the specimen, its numbers rounded to float32 first."""
+
+    def array(a):
+        return jnp.asarray(np.asarray(a, np.float32), dtype)
+
+    mesh = mesh_from(np.asarray(s.rest, np.float32), s.faces, dtype=dtype)
+    material = jax.tree.map(array, s.material)
+    surface = surface_from(s.rest, s.body, s.body_faces, smooth=False)
+    smooth = surface_from(s.rest, s.body, s.body_faces, smooth=True)
+    found = {}
+    for name in names:
+        terms = TERMS[name]
+        own = replace(material, membrane=tuple(map(array, s.membranes.get(name, ()))))
+        on = smooth if terms.collision == "smooth" else surface
+        pressed = None
+        if terms.friction:
+            pressed = pressure(array(s.carried), array(s.body), on, replace(ALONE, collision="plane"), own)
+        groups = groups_from(mesh) if terms.self_contact else None
+        frame = Frame(
+            array(s.dt), array(s.three[1]), array(s.three[2]), array(s.body), array(s.blended), array(s.carried), pressed
+        )
+        garment = Garment(mesh, jnp.asarray(s.pins, jnp.int32), groups)
+        found[name] = derivatives(terms, array(s.three[0]), array(s.along), garment, own, frame, on)
+    return found

@@ -1,0 +1,419 @@
+"""Where does it break? Energies, networks, simulator and training, each swept along one axis after another until they do.
+
+    python -m experiments.stability [--out experiments/results] [--only energies networks simulator training runs]
+
+All is worked out in float32 and in float64 from the same numbers. A cell of the map is how far the two are apart, as a share
+of the result: of an energy the worst of its value, its gradient and its second derivative along a direction; of networks and
+simulator the vertices. It is `safe` up to a thousandth, `at risk` above it, `broken` where a number is not finite or the solver
+gives up. Training has nothing to be compared with: it is safe where no step is dropped and the energy falls. Writes
+stability_PART.csv, .md and .png of every part. Twenty minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.specimens import TERMS, along_axis, evaluated, shapes, specimen
+from experiments.study import axes_of, changed, write
+from ncs_jax import InputError, Scene, assemble, load_scene, scene_from, train
+from ncs_jax.assembly import track_of
+from ncs_jax.io import MotionRecord
+from ncs_jax.io.npz import write_npz
+from ncs_jax.model import Model
+from ncs_jax.motion import Track
+from ncs_jax.objective import Material
+from ncs_jax.rollout import animate
+from ncs_jax.simulator import simulate, simulator_from
+from ncs_jax.solver.minimise import CONVERGED, Settings
+from ncs_jax.training import TrainState, batches, chunk_runner, initial_state, with_bodies
+
+TOLERANCE = 1e-3
+STATES = ("safe", "at risk", "broken")
+
+
+def tens(low: int, high: int) -> tuple[float, ...]:
+    """10^low to 10^high."""
+    return tuple(10.0**k for k in range(low, high + 1))
+
+
+TIMES = (1 / 1000, 1 / 480, 1 / 240, 1 / 120, 1 / 60, 1 / 30, 1 / 15, 1 / 5, 1 / 2)
+PHYSICS: dict[str, tuple[float, ...]] = {
+    "time step, s": TIMES,
+    "stiffness, times the default": tens(-6, 9),
+    "density, kg/m^2": tens(-4, 4),
+    "gravity, g": (0, *tens(-2, 2)),
+    "size, times the default": tens(-3, 3),
+    "from the origin, m": (0, *tens(0, 5)),
+}
+
+
+def apart(single: Any, double: Any) -> float:
+    """How far a result in float32 is from that in float64, as a share of it; infinite where a number is not finite."""
+    a, b = (np.asarray(v, np.float64) for v in (single, double))
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+        return np.inf
+    size = float(np.linalg.norm(b))
+    return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != 0))
+
+
+def state(error: float) -> str:
+    """What a cell of the map says."""
+    return STATES[2 if not np.isfinite(error) else int(error > TOLERANCE)]
+
+
+def cell(subject: str, axis: str, value: Any, error: float, **more: Any) -> dict:
+    """One row of the map's table."""
+    return {"subject": subject, "axis": axis, "value": value, "error": error, "state": state(error), **more}
+
+
+# Energies
+
+
+def of_energies(scene: Scene, quick: bool) -> list[dict]:
+    """Every term along every axis, and in every shape."""
+    s = specimen(scene)
+    cases = [(axis, value, along_axis(s, axis, value)) for axis, values in PHYSICS.items() for value in values]
+    cases += [("shape", name, shaped) for name, shaped in shapes(s)]
+    rows = []
+    for axis, value, case in cases[:: 20 if quick else 1]:
+        single, double = (evaluated(case, list(TERMS), dtype) for dtype in (jnp.float32, jnp.float64))
+        rows += [cell(n, axis, value, max(map(apart, single[n], double[n]))) for n in TERMS]
+    return rows
+
+
+# Networks
+
+
+@dataclass(frozen=True)
+class Wearer:
+    """A trained garment in both precisions."""
+
+    assembly: Any
+    double: Any
+    params: dict
+
+    def vertices(self, record: MotionRecord, alpha: float = 1.0) -> list[np.ndarray]:
+        """Seen from the root, in float32 and in float64."""
+        found = []
+        for a, dtype in ((self.assembly, jnp.float32), (self.double, jnp.float64)):
+            track = track_of(a.model, record)
+            params = jax.tree.map(lambda p, dtype=dtype: jnp.asarray(p, dtype), self.params)
+            x = track.relative(animated(a.network, a.model, params, track, jnp.asarray(alpha, dtype)))
+            found.append(x.astype(np.float64) - np.asarray(track.matrices[:, 0, :, 3], np.float64)[:, None])
+        return found
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def animated(network, model: Model, params: dict, track: Track, alpha):
+    """The vertices of a motion."""
+    return animate(model, network, params, track, alpha)
+
+
+def wandering(like: MotionRecord, frames: int) -> MotionRecord:
+    """A character that turns its joints at random, and walks where it likes."""
+    rng, joints = np.random.default_rng(1), like.poses.shape[1]
+    t = np.arange(frames)[:, None, None] / like.fps
+    sizes, rates = 0.2 * rng.standard_normal((4, joints, 3)), rng.uniform(0.5, 9, (4, joints, 3))
+    waves = [size * np.sin(rate * t + k) for k, (size, rate) in enumerate(zip(sizes, rates, strict=True))]
+    poses = np.sum(waves, axis=0)
+    way = np.cumsum(0.03 * np.sin(0.7 * t[:, 0] + np.arange(3)) * [1, 0, 1], axis=0)
+    return MotionRecord(poses.astype(np.float32), way, like.fps, like.joint_names)
+
+
+def motions(record: MotionRecord) -> Iterator[tuple[str, float, MotionRecord, float]]:
+    """(axis, value, motion, alpha)."""
+    frames = np.arange(len(record.poses))
+    middle = len(frames) // 2
+    for alpha in (0, 0.5, 1, 2, 5, 10, 30, 100):
+        yield "alpha", alpha, record, float(alpha)
+    for speed in (1, 2, 5, 10, 30, 100):
+        at = frames * speed % len(frames)
+        yield "motion, times as fast", speed, replace(record, poses=record.poses[at], translation=record.translation[at]), 1.0
+    for away in PHYSICS["from the origin, m"]:
+        yield (
+            "from the origin, m",
+            away,
+            replace(record, translation=record.translation + away * np.array([0.6, 0.0, 0.8])),
+            1.0,
+        )
+    for angle in (1, 10, 90, 179, 180):
+        poses = record.poses.copy()
+        poses[middle:, :, 0] += np.radians(angle)
+        yield "all joints turned at once, degrees", angle, replace(record, poses=poses), 1.0
+    for jump in tens(-1, 4):
+        translation = record.translation + jump * (frames >= middle)[:, None]
+        yield "jump within a frame, m", jump, replace(record, translation=translation), 1.0
+
+
+def of_networks(scene: Scene, quick: bool) -> list[dict]:
+    """A network of 300 steps on every kind of motion."""
+    run = train(scene, steps=10 if quick else 300)
+    a = run.assembly
+    wearer = Wearer(a, assemble(scene, dtype=jnp.float64), run.params)
+    record = run.motion(scene.motion.files[0])
+    cases = list(motions(record))
+    rows = [
+        cell("network", axis, value, apart(*wearer.vertices(case, alpha)))
+        for axis, value, case, alpha in cases[:: 9 if quick else 1]
+    ]
+    long = 100 if quick else 10_000
+    restless, resting = wandering(record, long), np.minimum(np.arange(long), len(record.poses) - 1)
+    rested = replace(record, poses=record.poses[resting], translation=record.translation[resting])
+    for axis, motion in (("frames of random motion", restless), ("frames after the motion", rested)):
+        single, double = wearer.vertices(motion)
+        for value in (10.0**k for k in range(1, 5) if 10**k <= long):
+            part = slice(int(0.9 * value), int(value))
+            rows.append(cell("network", axis, value, apart(single[part], double[part])))
+    for fps in [30] if quick else [1, 5, 15, 30, 60, 120, 240, 1000]:
+        once, twice = (replace(b, model=replace(b.model, fps=float(fps))) for b in (a, wearer.double))
+        used = replace(record, fps=float(fps))
+        rows.append(cell("network", "frames per second of use", fps, apart(*Wearer(once, twice, run.params).vertices(used))))
+    return rows
+
+
+# Simulator and training
+
+
+def hanging(folder: Path, size: float = 1.0, fps: float = 30.0, away: float = 0.0, jump: float = 0.0) -> Scene:
+    """A square sheet that hangs from a bar, which begins to move; lengths in m."""
+    n = 12
+    y, x = np.mgrid[:n, :n] / (n - 1) * size
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    a, b, c, d = corner, corner + 1, corner + n, corner + n + 1
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
+    place = np.stack([x, y, 0.1 * np.sin(7 * x / size) * size], axis=-1).reshape(-1, 3)
+    name = f"{size:g}_{fps:g}_{away:g}_{jump:g}"
+    write_npz(folder / f"sheet_{size:g}.npz", vertices=place, faces=faces, group_pins=np.arange(n * (n - 1), n * n))
+    way = np.zeros((8, 3))
+    way[:, 2] = size * 0.3 * (1 - np.cos(np.arange(8) / 30 * 6))
+    way[4:, 0] += jump * size
+    write_npz(folder / f"bar_{name}.npz", poses=np.zeros((8, 1, 3)), trans=way + away, fps=np.array(fps))
+    tables = {
+        "body": {"file": "none"},
+        "garment": {"file": f"sheet_{size:g}.npz", "pins": "pins"},
+        "motion": {"files": [f"bar_{name}.npz"], "fps": fps},
+        "network": {"static": [16, 32], "dynamic": [32], "decoder": [32], "modes": 16},
+        "training": {"window": 4, "batch": 8},
+    }
+    return scene_from(tables, source=str(folder / "scene.toml"))
+
+
+def materials(material: Material, axis: str, value: float) -> Material:
+    """At a value of one of the axes of PHYSICS that are of the material."""
+    if axis.startswith("stiffness"):
+        material = replace(material, membrane=tuple(n * n.dtype.type(value) for n in material.membrane))
+        names: tuple[str, ...] = ("bending", "collision", "pinning")
+    else:
+        names = ("gravity",) if axis.startswith("gravity") else ("density",)
+        value = value if axis.startswith("gravity") else value / float(material.density)
+    return replace(material, **{n: getattr(material, n) * getattr(material, n).dtype.type(value) for n in names})
+
+
+def hung(folder: Path, axis: str, value: float, dtype: Any):
+    """The sheet made ready at a value of an axis."""
+    field = {"time": "fps", "size": "size", "from": "away", "jump": "jump"}.get(axis.split()[0].strip(","))
+    own = {} if field is None else {field: 1 / value if field == "fps" else value}
+    a = assemble(hanging(folder, **own), dtype=dtype)
+    if own:
+        return a
+    return replace(a, model=replace(a.model, material=materials(a.model.material, axis, value)))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def simulated(simulator, track: Track, settings: Settings):
+    """Vertices and how it went."""
+    return simulate(simulator, track, settings)
+
+
+SWEPT = {**PHYSICS, "jump within a frame, sizes": tens(-1, 4)}
+
+
+def of_simulator(scene: Scene, quick: bool) -> list[dict]:
+    """A sheet that hangs from a bar, along every axis."""
+    del scene
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for axis, values in SWEPT.items():
+            for value in values[:: 9 if quick else 1]:
+                found = []
+                for dtype in (jnp.float32, jnp.float64):
+                    a = hung(Path(folder), axis, value, dtype)
+                    x, solution = simulated(simulator_from(a.model), a.track, Settings())
+                    found.append((a.track.relative(x) - np.asarray(a.track.matrices)[:, :1, :, 3], solution))
+                (single, solution), (double, exact) = found
+                good = bool(np.all(np.asarray(solution.status) == CONVERGED))
+                error = apart(single, double) if good or not np.all(np.isfinite(single)) else max(apart(single, double), 1.0)
+                rows.append(
+                    cell(
+                        "simulator", axis, value, error, residual=float(np.max(solution.residual)),
+                        iterations=int(np.max(solution.iterations)), status=int(np.max(solution.status)),
+                        status64=int(np.max(exact.status)),
+                    )
+                )  # fmt: skip
+    return rows
+
+
+def of_training(scene: Scene, quick: bool) -> list[dict]:
+    """The same sheet learned for 60 steps. The error is the last energy over the first, less one, where that is above zero."""
+    del scene
+    rows, steps = [], 60
+    with tempfile.TemporaryDirectory() as folder:
+        for axis, values in SWEPT.items():
+            for value in values[:: 9 if quick else 1]:
+                a = hung(Path(folder), axis, value, jnp.float32)
+                spec, network = a.scene.training, cast(Any, a.network)
+                ends = batches(len(a.track.start), spec.batch, 0, 0, steps)
+                begun = initial_state(a.model, a.network, 0)
+                end, logs = runner(network, spec)(begun, ends, np.zeros_like(ends), steps, a.model, a.track)
+                rows.append(fall("training", axis, value, end, logs))
+    return rows
+
+
+EDGES: dict[str, tuple[str, dict]] = {
+    "T-shirt, soft and light, 240 frames/s": (
+        "ncs:tshirt",
+        {"motion": {"fps": 240.0}, "physics": {"density": 0.01, "membrane": {"lam": 0.0418, "mu": 0.0222}}},
+    ),
+    "T-shirt, stiff and heavy, 5 frames/s": (
+        "ncs:tshirt",
+        {"motion": {"fps": 5.0}, "physics": {"density": 10.0, "membrane": {"lam": 4.18e5, "mu": 2.22e5}}},
+    ),
+    "skirt, bending 10,000 times as stiff, contact too": (
+        "ncs:skirt", {"physics": {"bending": {"stiffness": 0.1}, "collision": {"stiffness": 1e5}}},
+    ),
+    "skirt, Baraff-Witkin, gravity 10 g": (
+        "ncs:skirt", {"physics": {"gravity": (0.0, -98.1, 0.0), "membrane": {"model": "baraff_witkin"}}},
+    ),
+}  # fmt: skip
+
+
+def of_runs(scene: Scene, quick: bool) -> list[dict]:
+    """Five seeds each of four scenes at the edges, 500 steps. The error is as in `of_training`."""
+    del scene
+    rows, steps = [], 20 if quick else 500
+    for name, (base, tables) in EDGES.items():
+        a = assemble(changed(load_scene(base), **tables))
+        spec, network = a.scene.training, cast(Any, a.network)
+        track = with_bodies(a.model, a.track, spec.batch)
+        for seed in range(1 if quick else 5):
+            ends = batches(len(track.start), spec.batch, seed, 0, steps)
+            begun = initial_state(a.model, a.network, seed)
+            end, logs = runner(network, spec)(begun, ends, np.zeros_like(ends), steps, a.model, track)
+            rows.append(fall("training", name, seed, end, logs))
+    return rows
+
+
+def fall(subject: str, axis: str, value: Any, end: TrainState, logs: dict) -> dict:
+    """The row of a training: how much higher its last energies are than its first, or that a step was dropped."""
+    total = np.asarray(sum(logs.values()), np.float64)
+    tenth = max(1, len(total) // 10)
+    first, last = total[:tenth].mean(), total[-tenth:].mean()
+    bad = int(end.dropped) > 0 or not np.all(np.isfinite(total))
+    error = np.inf if bad else max(0.0, (last - first) / max(abs(first), 1e-30))
+    return cell(subject, axis, value, error, dropped=int(end.dropped), first=first, last=last)
+
+
+@functools.cache
+def runner(network: Any, spec: Any):
+    """One compiled training for all that share it."""
+    return chunk_runner(network, spec)
+
+
+# The map
+
+PARTS: dict[str, Callable[[Scene, bool], list[dict]]] = {
+    "energies": of_energies,
+    "networks": of_networks,
+    "simulator": of_simulator,
+    "training": of_training,
+    "runs": of_runs,
+}
+
+
+def shown(value: Any) -> str:
+    """A value of an axis."""
+    return f"{value:.3g}" if isinstance(value, int | float) else str(value)
+
+
+def ranges(rows: Sequence[dict]) -> list[dict]:
+    """For every subject and axis: from where to where it is safe, and the first values beyond."""
+    found = []
+    for subject, axis in dict.fromkeys((r["subject"], r["axis"]) for r in rows):
+        own = [r for r in rows if (r["subject"], r["axis"]) == (subject, axis)]
+        finite = [r["error"] for r in own if np.isfinite(r["error"])]
+        told = {s: ", ".join(shown(r["value"]) for r in own if r["state"] == s) for s in STATES}
+        found.append({"subject": subject, "axis": axis, **told, "worst": max(finite, default=np.inf)})
+    return found
+
+
+def draw(path: Path, rows: Sequence[dict]) -> None:
+    """A panel for every axis: subjects over values, coloured by the error; black: broken."""
+    from matplotlib.colors import LogNorm
+
+    every = list(dict.fromkeys(r["axis"] for r in rows))
+    subjects = list(dict.fromkeys(r["subject"] for r in rows))
+    with axes_of(path, len(every), (3.2, 1.8 + 0.22 * len(subjects))) as panels:
+        for place, (axes, axis) in enumerate(zip(panels, every, strict=True)):
+            values = list(dict.fromkeys(r["value"] for r in rows if r["axis"] == axis))
+            table = np.full((len(subjects), len(values)), np.nan)
+            for r in rows:
+                if r["axis"] == axis:
+                    table[subjects.index(r["subject"]), values.index(r["value"])] = max(r["error"], 1e-9)
+            axes.set_facecolor("white")
+            shown = axes.imshow(np.ma.masked_invalid(table), norm=LogNorm(1e-8, 1), cmap="RdYlGn_r", aspect="auto")
+            for i, j in np.argwhere(np.isinf(table)):
+                axes.fill([j - 0.5, j + 0.5, j + 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5], color="black")
+            axes.set_xticks(range(len(values)), map(shown, values), rotation=90, fontsize=7)
+            axes.set_yticks(range(len(subjects)), subjects if place == 0 else [""] * len(subjects))
+            axes.set_title(axis, fontsize=9)
+        axes.figure.colorbar(shown, ax=axes, label="float32 from float64, share")
+
+
+def experiment(scene: Scene, out: Path, *, only: Sequence[str] = (), quick: bool = False) -> dict[str, list[dict]]:
+    """Measure every part and write its tables and its picture into `out`."""
+    found = {}
+    with jax.enable_x64(True):
+        for name, part in PARTS.items():
+            if only and name not in only:
+                continue
+            rows = part(scene, quick)
+            write(out, f"stability_{name}_cells", rows, {"subject": "", "axis": "", "value": "", "error": "", "state": ""})
+            write(
+                out, f"stability_{name}", ranges(rows), {"subject": "", "axis": "", **{s: s for s in STATES}, "worst": "worst"}
+            )
+            draw(out / f"stability_{name}.png", rows)
+            found[name] = rows
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
+    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=(), help="these parts")
+    parser.add_argument("--quick", action="store_true", help="a few cells of each, to try it out")
+    parser.add_argument("--out", default="experiments/results", help="folder for tables and pictures")
+    o = parser.parse_args(arguments)
+    try:
+        found = experiment(load_scene(o.scene), Path(o.out), only=o.only, quick=o.quick)
+    except InputError as error:
+        print(f"stability: {error}", file=sys.stderr)
+        return 2
+    for name, rows in found.items():
+        print(name, {s: sum(r["state"] == s for r in rows) for s in STATES})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
