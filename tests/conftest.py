@@ -31,6 +31,13 @@ THOROUGH = bool(os.environ.get("NCS_THOROUGH"))
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
+@pytest.fixture(autouse=True, scope="module")
+def programs():
+    """What a module has compiled is let go after it: a process may hold only so many pieces of memory, and dies of one more."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """The only randomness of the tests, the same in every run."""
