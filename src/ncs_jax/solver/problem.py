@@ -26,6 +26,7 @@ __all__ = ["Point", "Problem", "apart", "blocks", "come", "descended", "dot", "e
            "knowing", "look", "looked", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
+STATIC = 1 / 30  # s: the time step that damps the way to a static state, where the frame's own is shorter
 LEAST_STEP = 1e-6  # of a step: below it the line search gives up
 REACH = 2  # how far the search for self-contact looks, in thicknesses of the cloth
 
@@ -178,9 +179,10 @@ def blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
         terms = replace(terms, pinning=False)
     touching = None if point.contact is None else point.contact.blocks
     diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, problem.frame, terms, touching)
-    # Without inertia the mass still holds what nothing else does: it damps the way to the static state.
-    mass = problem.mass
-    weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / problem.frame.dt**2
+    # Without inertia the mass still holds what nothing else does: it damps the way to the static state, however short a frame.
+    mass, dt = problem.mass, problem.frame.dt
+    dt = jnp.where(problem.moving > 0, dt, jnp.maximum(dt, STATIC))
+    weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / dt**2
     if problem.pinned is not None:
         off = jnp.where(jnp.all(problem.free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
     if point.folds is not None:
