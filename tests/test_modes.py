@@ -141,6 +141,25 @@ def test_a_long_strip_vibrates_in_cosines():
         np.testing.assert_allclose(np.abs(unit[:, n] @ cosine) / len(vertices), 1, rtol=2e-2)
 
 
+def test_a_strip_held_at_its_end_vibrates_in_sines():
+    """Modes of the interval with one end held: eigenvalues ((n + 1/2) pi / L)^2, and nothing moves there."""
+    vertices, faces = sheet(2, 101, 0.01)
+    held = np.flatnonzero(vertices[:, 0] == 0)
+    basis = modal_basis(vertices, faces, lumped(vertices, faces), 4, held=held)
+    assert len(held) == 2 and not basis[held].any()
+    _, unit, _, values = scaled_back(vertices, faces, basis, 0.02)
+    wave = (np.arange(4) + 0.5) * np.pi / 1.0
+    np.testing.assert_allclose(values, wave**2, rtol=5e-3)
+    for n in range(3):
+        sine = np.sqrt(2) * np.sin(wave[n] * vertices[:, 0])
+        np.testing.assert_allclose(np.abs(unit[:, n] @ sine) / len(vertices), 1, rtol=2e-2)
+
+
+def test_no_mode_where_everything_is_held():
+    vertices, faces = sheet(3, 3, 0.01)
+    assert modal_basis(vertices, faces, lumped(vertices, faces), 5, held=np.arange(9)).shape == (9, 0)
+
+
 def test_the_same_modes_every_time_and_wherever_the_garment_is():
     vertices, faces = lopsided(ball(2))
     area = lumped(vertices, faces)

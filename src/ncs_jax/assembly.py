@@ -169,7 +169,7 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
     motions, track = {}, None
     if prepared is None:
         motions = {name: load_motion(scene, name, body) for name in (*scene.motion.files, *scene.motion.validation)}
-        prepared = _prepare(scene, body, garment, mesh, [motions[name] for name in scene.motion.files])
+        prepared = _prepare(scene, body, garment, mesh, pins, [motions[name] for name in scene.motion.files])
         model = _model(scene, prepared, body, garment, mesh, pins, dtype)
         track = _training_track(scene, model, body, [motions[name] for name in scene.motion.files])
     else:
@@ -179,12 +179,12 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
     return Assembly(scene, prepared, model, _network(scene, model), body, garment, track, motions)
 
 
-def _prepare(scene, body, garment, mesh, records) -> Prepared:
+def _prepare(scene, body, garment, mesh, pins, records) -> Prepared:
     moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in records)
-    count = min(scene.network.modes, len(garment.vertices) - 1)
     basis = np.zeros((len(garment.vertices), 0), np.float32)
-    if count:
-        basis = modal_basis(garment.vertices, garment.faces, np.asarray(mesh.vertex_area), count)
+    if scene.network.modes:
+        held = pins if scene.physics.pinning.stiffness > 0 else ()
+        basis = modal_basis(garment.vertices, garment.faces, np.asarray(mesh.vertex_area), scene.network.modes, held=held)
     if body is None:
         weights = np.ones((len(garment.vertices), 1), np.float32)
         return Prepared(np.zeros(1, np.int64), np.asarray(moves), weights, np.zeros(0, np.int64), basis)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -26,7 +28,12 @@ def laplacian(vertices: np.ndarray, faces: np.ndarray):
 
 
 def modal_basis(
-    vertices: np.ndarray, faces: np.ndarray, area: np.ndarray, count: int, amplitude: float = 0.02
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    area: np.ndarray,
+    count: int,
+    amplitude: float = 0.02,
+    held: np.ndarray | Sequence[int] = (),
 ) -> Float[np.ndarray, "verts modes"]:
     """The `count` smoothest modes of a garment, each with the displacement that costs about the same membrane energy.
 
@@ -35,6 +42,7 @@ def modal_basis(
     Args:
         vertices: (verts, 3) rest positions in m. faces: (faces, 3). area: (verts,) lumped areas in m^2.
         amplitude: displacement of the smoothest modes per unit of coefficient, m. lambda_ref is (2 pi / garment size)^2.
+        held: numbers of vertices that do not move, as pins: the modes are zero there, for moving them costs more than all else.
 
     An optimiser that treats all coefficients alike (Adam) then treats drape and swing, which are soft and global, as well as
     strain, which is stiff and local; its noise is spread over the modes at equal energy.
@@ -44,16 +52,21 @@ def modal_basis(
 
     vertices, area = np.asarray(vertices, np.float64), np.asarray(area, np.float64)
     mass = np.maximum(area, 1e-3 * area.mean())  # a vertex without faces has no area of its own
-    matrix = laplacian(vertices, np.asarray(faces))
+    free = np.setdiff1d(np.arange(len(vertices)), np.asarray(held, int))
+    matrix, mass = laplacian(vertices, np.asarray(faces))[free][:, free], mass[free]
     reference = (2 * np.pi) ** 2 / max(float(np.sum(np.ptp(vertices, axis=0) ** 2)), 1e-12)
-    count = min(count, len(vertices) - 1)
-    if len(vertices) <= 4 * count + 64:
+    count = max(min(count, len(free) - 1), 0)
+    basis = np.zeros((len(vertices), count), np.float32)
+    if not count:
+        return basis
+    if len(free) <= 4 * count + 64:
         from scipy.linalg import eigh
 
         values, vectors = eigh(matrix.toarray(), np.diag(mass), subset_by_index=(0, count - 1))
     else:  # a fixed start vector: ARPACK's own is random
-        start = np.random.default_rng(0).normal(size=len(vertices))
+        start = np.random.default_rng(0).normal(size=len(free))
         values, vectors = eigsh(matrix, count, diags(mass).tocsc(), sigma=-reference / 10, which="LM", v0=start)
     vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(count)] < 0, -1, 1)
     scale = amplitude * np.sqrt(area.sum()) / np.sqrt(1 + np.maximum(values, 0) / reference)
-    return (vectors * scale).astype(np.float32)
+    basis[free] = vectors * scale
+    return basis
