@@ -57,6 +57,22 @@ def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method)
         np.testing.assert_allclose(assembly.network.windows(params, track, ends, 10, 3)[0][:, 0], whole[0][3:6], atol=1e-13)
 
 
+def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap(tmp_path):
+    """Of two motions end to end, the second from rest again; of many frames and few windows, from the windows alone."""
+    assembly, params, motion = ready(tmp_path, cell="linear")
+    once = assembly.network.codes(params, track_of(assembly.model, motion)).dynamic
+    track, frames = track_of(assembly.model, motion, motion), len(once)
+    ends = jnp.arange(2 * frames, dtype=jnp.int32)
+    found = assembly.network.windows(params, track, ends, 4, 3).dynamic
+    for begin in (0, frames):
+        for back in range(3):
+            after = found[2 - back, begin + back : begin + frames]
+            np.testing.assert_allclose(after, once[: frames - back], rtol=0, atol=1e-13)
+            assert not found[2 - back, begin : begin + back].any()  # before it began
+    few = assembly.network.windows(params, track, ends[frames - 1 : frames], 4, 1).dynamic
+    assert np.abs(few[0, 0] - once[-1]).max() > 1e-6
+
+
 def test_a_pose_alone_decides_with_pbns_and_not_with_the_others(tmp_path):
     for method in METHODS:
         assembly, params, motion = ready(tmp_path, method=method)

@@ -24,9 +24,9 @@ def shaken(params, key=1):
     return jax.tree.unflatten(tree, moved)
 
 
-def ready(folder, dtype=jnp.float64, method="ncs"):
+def ready(folder, dtype=jnp.float64, method="ncs", cell="gated"):
     tables = load_scene(write_scene(folder)).to_dict()
-    tables["network"]["method"] = method
+    tables["network"] |= {"method": method, "cell": cell}
     assembly = assemble(scene_from(tables), dtype=dtype)
     params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))
     params = jax.tree.map(lambda p: p.astype(dtype), params)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 __all__ = ["Decoder", "DynamicEncoder", "LinearEncoder", "StaticEncoder", "merge", "recurrence"]
 
@@ -189,12 +189,19 @@ class LinearEncoder(DynamicEncoder):
         self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"]
     ) -> Float[Array, "frames *batch code"]:
         """Codes of a sequence from its features, time leading."""
+        return self.of_motions(features, state, jnp.zeros(len(features), bool))
 
-        def step(h, f):
-            h = self.step(h, f)
+    def of_motions(
+        self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"], begins: Bool[Array, "frames"]
+    ) -> Float[Array, "frames *batch code"]:
+        """Codes of motions end to end, each but the first from rest at the frame where it begins."""
+
+        def step(h, frame):
+            f, begin = frame
+            h = self.step(jnp.where(begin, 0, h), f)
             return h, h
 
-        return lax.scan(step, state, features)[1]
+        return lax.scan(step, state, (features, begins), unroll=8)[1]
 
 
 @jax.custom_vjp

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from ncs_jax.methods.shared import Codes, descriptor_sizes
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
-from ncs_jax.networks import Decoder, DynamicEncoder, StaticEncoder
+from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder
 from ncs_jax.objective import Terms
 
 __all__ = ["NCS"]
@@ -75,7 +75,10 @@ class NCS:
         return Codes(fixed, jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest)))
 
     def windows(self, params: dict, track: Track, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Time leading. Frames before a motion's start are rest: zero dynamic descriptors."""
+        """Time leading. Frames before a motion's start are rest: zero dynamic descriptors.
+
+        Of few motions (fewer frames than all windows together) a linear cell knows the whole motion before.
+        """
         start = track.start[ends]
         back = ends[None] - jnp.arange(length - 1, -1, -1, dtype=ends.dtype)[:, None]
         inside = jnp.maximum(back, start[None])
@@ -86,6 +89,11 @@ class NCS:
         frames = len(track.dynamic)
         if frames < back.size:  # windows overlap: what each frame gives by itself is computed once, and picked by a product
             every = jnp.asarray(self.dynamic.apply(variables, track.dynamic, method="features"))
+            if isinstance(self.dynamic, LinearEncoder):  # so cheap that all motions are gone through from their starts
+                begins = track.start == jnp.arange(frames, dtype=track.start.dtype)
+                rest = jnp.zeros(self.state, every.dtype)
+                states = jnp.asarray(self.dynamic.apply(variables, every, rest, begins, method="of_motions"))
+                return Codes(fixed, jnp.where(begun[length - last :, :, None], states[inside[length - last :]], 0))
             pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
             features = jnp.einsum("lbf,fg->lbg", pick, every)
         else:
