@@ -27,6 +27,7 @@ from benchmarks import work
 from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_memory, read, run, timed
 from ncs_jax import assemble, local_rotations, training
 from ncs_jax.assembly import Assembly
+from ncs_jax.devices import give_back
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.methods.shared import garment_blend
 from ncs_jax.model import Model, pose_body
@@ -42,6 +43,7 @@ DEPTH = {"step": 0, "descriptors": 0, "network": 1, "physics": 1, "optimiser": 1
 def ready(scene: Scene) -> Assembly:
     """A scene as training takes it, with what its motions fix."""
     assembly = assemble(scene)
+    give_back()  # as training does
     return replace(assembly, track=training.with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import ctypes
 import os
 import platform
 import time
@@ -21,7 +19,7 @@ from ncs_jax import io
 from ncs_jax.assembly import Assembly, assemble, load_motion, track_of
 from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_run, write_prepared, write_run
 from ncs_jax.compression import compress
-from ncs_jax.devices import batch_mesh, compiled, copied, divided, local
+from ncs_jax.devices import batch_mesh, compiled, copied, divided, give_back, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
 from ncs_jax.motion import Track
@@ -107,12 +105,6 @@ class Run:
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
 
 
-def _give_back() -> None:
-    """Return to the system what reading and compiling leave over, 200 MB that glibc would keep."""
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 _animate = jax.jit(animate, static_argnums=1)
 
 
@@ -174,7 +166,7 @@ def train(
     if out is not None:
         check_writable(out)
     assembly = assemble(scene)
-    _give_back()
+    give_back()
     spec, model, network, track = scene.training, assembly.model, assembly.network, assembly.track
     seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
     mesh = batch_mesh(spec.batch)
@@ -247,7 +239,7 @@ def train(
         state, logs = run_steps(at, count, state, steps)
         here, logs = local(mesh, (state, logs))
         if pace is None:  # this chunk was compiled
-            _give_back()
+            give_back()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         done = at + count
         seen = {
