@@ -194,7 +194,7 @@ class LinearEncoder(DynamicEncoder):
     def of_motions(
         self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"], begins: Bool[Array, "frames"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of motions end to end, each but the first from rest at the frame where it begins."""
+        """Codes of motions end to end, from rest wherever one begins."""
 
         def step(h, frame):
             f, begin = frame
