@@ -72,7 +72,7 @@ class Windowed(NCS):
         static = NCS(self.static, None, self.decoder).init(keys, model)
         return static | {"dynamic": self.dynamic.init(keys[1], jnp.zeros((TAPS, *self.joints), model.basis.dtype))["params"]}
 
-    def step(self, params, state, static, dynamic):
+    def step(self, params, model, state, static, dynamic, matrices):
         """z_S of the frame, and z_D of the descriptors carried and the new ones."""
         seen = jnp.concatenate(
             [state.reshape(*state.shape[:-1], TAPS, *self.joints)[..., 1:, :, :], dynamic[..., None, :, :]], -3
@@ -80,7 +80,7 @@ class Windowed(NCS):
         code = self.dynamic.apply({"params": params["dynamic"]}, jnp.moveaxis(seen, -3, 0))[-1]
         return seen.reshape(state.shape), Codes(self._static(params, static), code)
 
-    def codes(self, params, track):
+    def codes(self, params, model, track):
         """Of every frame, from rest at the motion's start."""
         return Codes(self._static(params, track.static), self.dynamic.apply({"params": params["dynamic"]}, track.dynamic))
 
@@ -127,6 +127,7 @@ ARCHITECTURES: dict[str, str | Callable[[Any, Track], Method]] = {
     "with bias": biased,
     f"window of {TAPS} frames": windowed,
     "linear, contracting": "linear",
+    "the garment's own vibrations": "swing",
 }
 
 

@@ -47,13 +47,14 @@ class WithoutGravity(NCS):
     def _blind(self, descriptor, first):
         return descriptor.at[..., first : first + 3].set(0)
 
-    def step(self, params, state, static, dynamic):
+    def step(self, params, model, state, static, dynamic, matrices):
         """As without the gravity direction and its rate."""
-        return super().step(params, state, self._blind(static, SIX), None if dynamic is None else self._blind(dynamic, SIX))
+        static, dynamic = (None if d is None else self._blind(d, SIX) for d in (static, dynamic))
+        return super().step(params, model, state, static, dynamic, matrices)
 
-    def codes(self, params, track):
+    def codes(self, params, model, track):
         """As without the gravity direction and its rate."""
-        return super().codes(params, self._blinded(track))
+        return super().codes(params, model, self._blinded(track))
 
     def windows(self, params, track, ends, length, last):
         """As without the gravity direction and its rate."""

@@ -86,7 +86,9 @@ def test_the_work_of_a_network_is_that_of_its_products(tmp_path):
     needed = work.inference(model, merged, 1)
 
     def layers(static, dynamic, code):
-        return decode(network, merged, model, network.step(merged, code, static, dynamic)[1].together())
+        return decode(
+            network, merged, model, network.step(merged, model, code, static, dynamic, track.matrices[0])[1].together()
+        )
 
     track = assembly.track
     lowered = jax.jit(layers).lower(track.static[0], track.dynamic[0], jnp.zeros(network.dynamic.state))

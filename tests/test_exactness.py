@@ -206,8 +206,8 @@ def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
     frames = len(motion.poses)
     ends = jnp.array([frames - 1], jnp.int32)
     codes = jax.jit(lambda p, t: network.windows(p, t, ends, frames, frames))(params, track)
-    z_static, z_dynamic = (z[:, 0] for z in codes)
-    np.testing.assert_allclose(network.codes(params, track)[0], z_static, rtol=0, atol=1e-13)
+    z_static, z_dynamic = (z[:, 0] for z in codes[:2])
+    np.testing.assert_allclose(network.codes(params, model, track)[0], z_static, rtol=0, atol=1e-13)
     offsets = np.moveaxis(np.asarray(decode(network, params, model, z_static + alpha * z_dynamic)), -1, 0)
     blended = np.einsum("vj,fjab->fvab", model.blend.weights, np.asarray(track.matrices)[:, list(model.blend.joints)])
     unposed = np.asarray(model.garment.mesh.rest)[None] + offsets
@@ -222,7 +222,7 @@ def test_a_window_that_begins_within_the_motion_begins_at_rest(tmp_path):
     track = track_of(assembly.model, motion)
     end, length = 17, 6
     run_window = jax.jit(lambda p, t: network.windows(p, t, jnp.array([end, 2], jnp.int32), length, 2))
-    _, z = run_window(params, track)
+    _, z, _ = run_window(params, track)
     h = jnp.zeros(network.dynamic.state)
     for d in track.dynamic[end - length + 1 : end + 1]:
         before = h

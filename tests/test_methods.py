@@ -14,6 +14,7 @@ from ncs_jax.methods.ncs import NCS
 from ncs_jax.methods.pbns import PBNS
 from ncs_jax.methods.shared import Method
 from ncs_jax.methods.snug import SNUG
+from ncs_jax.methods.swing import Swing
 from ncs_jax.model import local_rotations
 from ncs_jax.objective import Frame, Terms, total
 from ncs_jax.rollout import stepper
@@ -23,7 +24,7 @@ from .scenes import write_scene
 from .test_rollout import edited, ready, run
 from .test_training import lowered, prepared, scopes
 
-METHODS = {"ncs": NCS, "pbns": PBNS, "snug": SNUG}
+METHODS = {"ncs": NCS, "pbns": PBNS, "snug": SNUG, "swing": Swing}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -43,11 +44,11 @@ def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, m
             np.testing.assert_allclose(x, expected[frame], rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])  # a swing is of the whole motion
 def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method):
     assembly, params, motion = ready(tmp_path, method=method)
     track, ends = track_of(assembly.model, motion), jnp.array([5, 9], jnp.int32)
-    whole = assembly.network.codes(params, track)
+    whole = assembly.network.codes(params, assembly.model, track)
     for of_all, of_windows in zip(whole, assembly.network.windows(params, track, ends, 10, 3), strict=True):
         assert (of_all is None) == (of_windows is None)
         if of_all is not None:
@@ -60,7 +61,7 @@ def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method)
 def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap(tmp_path):
     """Of two motions end to end, the second from rest again; of many frames and few windows, from the windows alone."""
     assembly, params, motion = ready(tmp_path, cell="linear")
-    once = assembly.network.codes(params, track_of(assembly.model, motion)).dynamic
+    once = assembly.network.codes(params, assembly.model, track_of(assembly.model, motion)).dynamic
     track, frames = track_of(assembly.model, motion, motion), len(once)
     ends = jnp.arange(2 * frames, dtype=jnp.int32)
     found = assembly.network.windows(params, track, ends, 4, 3).dynamic
@@ -85,7 +86,7 @@ def test_alpha_is_for_ncs_alone(tmp_path):
     for method in METHODS:
         assembly, params, motion = ready(tmp_path, method=method)
         apart = np.abs(run(assembly, params, motion, 2.0) - run(assembly, params, motion, 1.0)).max()
-        assert (apart > 1e-4) == assembly.network.controlled == (method == "ncs")
+        assert (apart > 1e-4) == assembly.network.controlled == (method in ("ncs", "swing"))
 
 
 def test_snug_sees_the_roots_motion(tmp_path):
@@ -98,7 +99,7 @@ def test_snug_sees_the_roots_motion(tmp_path):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_where_inertia_has_a_gradient(tmp_path, method, rng):
-    """By x_{t-1} and x_{t-2} exactly none with NCS, the whole of it with SNUG; PBNS has no inertia."""
+    """By x_{t-1} and x_{t-2} exactly none with NCS, the whole of it with SNUG; PBNS and a swing are trained without."""
     assembly, _, _ = ready(tmp_path, method=method)
     model = assembly.model
     terms = assembly.network.loss(Terms(None, bending=False, collision=None))
@@ -110,7 +111,7 @@ def test_where_inertia_has_a_gradient(tmp_path, method, rng):
     slope = jax.grad(energy)(x)
     away = np.asarray((x[0] - 2 * x[1] + x[2]) * model.fps**2)
     mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)[:, None]
-    share = {"ncs": (1, 0, 0), "pbns": (0, 0, 0), "snug": (1, -2, 1)}[method]
+    share = {"ncs": (1, 0, 0), "pbns": (0, 0, 0), "swing": (0, 0, 0), "snug": (1, -2, 1)}[method]
     weight = mass * np.asarray(model.material.gravity)
     for k in range(3):
         np.testing.assert_allclose(slope[k], share[k] * mass * away - (weight if k == 0 else 0), rtol=1e-9, atol=1e-12)

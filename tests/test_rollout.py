@@ -26,6 +26,9 @@ def shaken(params, key=1):
 
 def ready(folder, dtype=jnp.float64, method="ncs", cell="gated"):
     tables = load_scene(write_scene(folder)).to_dict()
+    if method == "swing":  # cloth that hangs on something
+        method = "ncs"
+        cell, tables["garment"]["pins"], tables["network"]["vibrations"] = "swing", "pins", 3
     tables["network"] |= {"method": method, "cell": cell}
     assembly = assemble(scene_from(tables), dtype=dtype)
     params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,20 @@ from ncs_jax.methods.ncs import NCS
 from ncs_jax.methods.pbns import PBNS
 from ncs_jax.methods.shared import Method
 from ncs_jax.methods.snug import SNUG
-from ncs_jax.model import Model, local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
+from ncs_jax.methods.swing import Swing
+from ncs_jax.model import (
+    Model,
+    Vibrations,
+    local_rotations,
+    pose_body,
+    smooth_weights,
+    touchable,
+    transfer_weights,
+    used_joints,
+)
 from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track, mirror, track
-from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder
+from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder, SwingEncoder
 from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix, resample
 from ncs_jax.scene import Scene
@@ -37,6 +47,7 @@ class Prepared:
 
     inputs: joints that the network reads, the root first. moves: whether the character ever moves. weights: the garment's
     skinning weights (verts, joints). part: the body vertices that the garment can touch. basis: its smooth modes, m.
+    vibrations: the directions of a swing (verts, 3, modes), m, and energy: of each of them, J; none without one.
     """
 
     inputs: np.ndarray
@@ -44,6 +55,8 @@ class Prepared:
     weights: np.ndarray
     part: np.ndarray
     basis: np.ndarray
+    vibrations: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 0), np.float32))
+    energy: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
 
 @dataclass(frozen=True)
@@ -174,8 +187,16 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
         track = _training_track(scene, model, body, [motions[name] for name in scene.motion.files])
     else:
         model = _model(scene, prepared, body, garment, mesh, pins, dtype)
-    if model.body is not None:
-        model = replace(model, surface=_surface(scene, model, _submesh(body.faces, prepared.part, len(body.vertices)), track))
+    smooth = scene.physics.collision.distance == "smooth"
+    faces = None if model.body is None else _submesh(body.faces, prepared.part, len(body.vertices))
+    if faces is not None:
+        model = replace(model, surface=_surface(model, faces, track, smooth))
+    spec = scene.network
+    if spec.method == "ncs" and spec.cell == "swing" and model.terms.inertia:
+        if not prepared.vibrations.size:
+            prepared = _vibrating(scene, prepared, model, faces, track)
+        vibrations = Vibrations(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype))
+        model = replace(model, vibrations=vibrations)
     return Assembly(scene, prepared, model, _network(scene, model), body, garment, track, motions)
 
 
@@ -264,7 +285,22 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
     )
 
 
-def _surface(scene, model: Model, faces, track: Track | None, samples: int = 8) -> Surface:
+def _vibrating(scene: Scene, prepared: Prepared, model: Model, faces, track: Track | None) -> Prepared:
+    """With the garment's softest vibrations: found with smooth contact, as a simulation converges with no other."""
+    from ncs_jax.vibration import softest
+
+    if faces is not None:
+        model = replace(model, terms=replace(model.terms, collision="smooth"), surface=_surface(model, faces, track, True))
+    found = softest(model, track, scene.network.vibrations)
+    if found is None:
+        raise InputError(
+            "a garment that hangs on something expected: it has no period to swing with", file=scene.source,
+            field="network.cell", value="swing", mend="pin it, put it on a body, or choose the gated or the linear cell",
+        )  # fmt: skip
+    return replace(prepared, vibrations=np.asarray(found.directions), energy=np.asarray(found.energy))
+
+
+def _surface(model: Model, faces, track: Track | None, smooth: bool, samples: int = 8) -> Surface:
     """The touchable body, its search prepared for what comes near what in a few poses of the motion."""
 
     def posed(matrices):
@@ -275,7 +311,7 @@ def _surface(scene, model: Model, faces, track: Track | None, samples: int = 8) 
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
         poses = list(zip(*map(np.asarray, jax.jit(jax.vmap(posed))(track.matrices[frames])), strict=True))
     rest, body = np.asarray(model.garment.mesh.rest), np.asarray(model.body)
-    return surface_from(rest, body, faces, smooth=scene.physics.collision.distance == "smooth", posed=poses)
+    return surface_from(rest, body, faces, smooth=smooth, posed=poses)
 
 
 def _training_track(scene, model: Model, body, records: list[io.MotionRecord]) -> Track:
@@ -311,7 +347,10 @@ def _network(scene: Scene, model: Model) -> Method:
     static = StaticEncoder(spec.static, dtype)
     if spec.method == "pbns":
         return PBNS(static, decoder, learned)
-    encoder = {"gated": DynamicEncoder, "linear": LinearEncoder}[spec.cell]
+    if model.vibrations is not None:
+        modes = model.vibrations.directions.shape[-1]
+        return Swing(static, SwingEncoder(spec.dynamic, state, dtype), decoder, verts, modes, spec.damping, learned)
+    encoder = {"linear": LinearEncoder}.get(spec.cell, DynamicEncoder)
     return NCS(static, encoder(spec.joint, spec.dynamic, state, dtype) if model.moves else None, decoder, learned)
 
 

@@ -86,11 +86,13 @@ def read_prepared(run: Path) -> Prepared:
     Raises:
         InputError: it is missing or damaged.
     """
-    names = [f.name for f in dataclasses.fields(Prepared)]
+    fields = dataclasses.fields(Prepared)
+    names = [f.name for f in fields]
     path = Path(run) / "prepared.npz"
     try:
         table = read_npz(path, names.__contains__)
-        return Prepared(**{name: table.array(name) for name in names})
+        first = [f.name for f in fields if f.default_factory is dataclasses.MISSING]  # of a run of an earlier version
+        return Prepared(**{name: table.array(name) for name in names if name in table or name in first})
     except InputError as error:
         raise InputError(error.expected, file=path, field=error.field, mend="train again into a new folder") from None
 

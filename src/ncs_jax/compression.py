@@ -35,7 +35,7 @@ def compress(
     smaller, params = for_inference(network, params, model)
     decoder = dict(params["decoder"])
     if rank:
-        z = smaller.codes(params, track).together()
+        z = smaller.codes(params, model, track).together()
         features = smaller.decoder.apply({"params": decoder}, z, method=Decoder.features)
         h, kernel, bias = (np.asarray(a, np.float64) for a in (features, *map(decoder["offsets"].get, ("kernel", "bias"))))
         if not 0 < rank <= min(h.shape):

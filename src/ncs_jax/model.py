@@ -18,6 +18,7 @@ from ncs_jax.rotations import axis_angle_to_matrix
 
 __all__ = [
     "Model",
+    "Vibrations",
     "local_rotations",
     "pose_body",
     "posed_bodies",
@@ -26,6 +27,18 @@ __all__ = [
     "transfer_weights",
     "used_joints",
 ]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Vibrations:
+    """The softest movements of a garment about its drape, in unposed space: see `vibration.softest`.
+
+    directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
+    """
+
+    directions: Float[Array, "verts 3 modes"]
+    energy: Float[Array, ""]
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +65,7 @@ class Model:
     descriptor: str = field(metadata={"static": True})
     fps: float = field(metadata={"static": True})
     moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
+    vibrations: Vibrations | None = None  # where the network swings along them
 
 
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:

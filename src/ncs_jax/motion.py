@@ -33,6 +33,7 @@ class Track:
     start: Int[Array, "frames"]
     bodies: Float[Array, "frames body 6"] | None = None  # positions in m and normals of the touchable body
     origin: Float[Array, "frames 3"] | None = None  # m
+    swing: Float[Array, "frames modes"] | None = None  # of the garment, see `methods.swing`
 
     def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
         """Positions measured from the track's origin, in the world, m."""

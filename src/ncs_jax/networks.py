@@ -13,7 +13,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["Decoder", "DynamicEncoder", "LinearEncoder", "StaticEncoder", "merge", "recurrence"]
+__all__ = ["Decoder", "DynamicEncoder", "LinearEncoder", "StaticEncoder", "SwingEncoder", "merge", "recurrence"]
 
 
 class StaticEncoder(nn.Module):
@@ -202,6 +202,23 @@ class LinearEncoder(DynamicEncoder):
             return h, h
 
         return lax.scan(step, state, (features, begins), unroll=8)[1]
+
+
+class SwingEncoder(nn.Module):
+    """z_D of a swing: a perceptron without bias, so that no swing gives zero and z_D(alpha q) = alpha z_D(q) for alpha >= 0."""
+
+    sizes: Sequence[int] = (256, 256)
+    code: int = 256
+    dtype: DTypeLike = jnp.float32
+
+    @nn.compact
+    def __call__(self, swing: Float[Array, "*batch modes"]) -> Float[Array, "*batch code"]:
+        """Code of each swing by itself, at first next to nothing."""
+        h = swing
+        dense = functools.partial(nn.Dense, use_bias=False, param_dtype=self.dtype)
+        for i, size in enumerate(self.sizes):
+            h = nn.relu(dense(size, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")(h))
+        return dense(self.code, kernel_init=nn.initializers.normal(1e-3), name="read")(h)
 
 
 @jax.custom_vjp

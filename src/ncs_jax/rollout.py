@@ -80,28 +80,31 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
         for _ in characters:
             every = jax.vmap(every)
         now, previous, matrices, static, dynamic = every(state.previous, state.before, state.started, rotations, translation)
-        code, codes = network.step(params, state.code, static, dynamic)
-        z = codes.together(jnp.asarray(alpha, code.dtype)[..., None])
-        x = _posed(model, network, params, weights, matrices.reshape(-1, *matrices.shape[-3:]), z.reshape(-1, z.shape[-1]))
-        return State(code, now, previous, jnp.ones(characters, bool)), x.reshape(*characters, *rest.shape)
+        code, codes = network.step(params, model, state.code, static, dynamic, matrices)
+        alpha = jnp.asarray(alpha, code.dtype)[..., None]
+        x = _posed(model, network, params, weights, matrices, codes.together(alpha), codes.swung(alpha))
+        return State(code, now, previous, jnp.ones(characters, bool)), x
 
     return Rollout(init, step)
 
 
-def _posed(model: Model, network: Method, params: dict, weights: Blend, matrices, z) -> Float[Array, "poses verts 3"]:
-    """Vertices of the garment with codes (poses, code) on joints (poses, joints, 3, 4), `BLOCK` at a time, m."""
-    poses = len(z)
+def _posed(model: Model, network: Method, params: dict, weights: Blend, matrices, z, swing) -> Float[Array, "*poses verts 3"]:
+    """Vertices of the garment with codes (*poses, code) on joints (*poses, joints, 3, 4), `BLOCK` at a time, m."""
+    shape, rest = matrices.shape[:-3], model.garment.mesh.rest
+    matrices = matrices.reshape(-1, *matrices.shape[-3:])
+    codes = tuple(None if c is None else c.reshape(-1, c.shape[-1]) for c in (z, swing))
+    poses = len(matrices)
     block = min(BLOCK, poses)
     at = np.minimum(np.arange(-(-poses // block) * block), poses - 1).reshape(-1, block)  # equal poses stay equal
 
     def some(args):
-        matrices, z = args
-        x = model.garment.mesh.rest[..., None] + decode(network, params, model, z)
+        matrices, codes = args
+        x = rest[..., None] + decode(network, params, model, *codes)
         return skin(blend(jnp.moveaxis(matrices, 0, -1), weights), x)
 
     # Turned at the end, outside the map: XLA would skin in that order too, ten times slower.
-    x = lax.map(some, (matrices[at], z[at]))
-    return jnp.moveaxis(x, -1, 1).reshape(-1, *model.garment.mesh.rest.shape)[:poses]
+    x = lax.map(some, jax.tree.map(lambda a: a[at], (matrices, codes)))
+    return jnp.moveaxis(x, -1, 1).reshape(-1, *rest.shape)[:poses].reshape(*shape, *rest.shape)
 
 
 def animate(
@@ -113,19 +116,21 @@ def animate(
         track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
             dynamic (alpha = 0 gives the same vertices).
     """
-    z = network.codes(params, track).together(alpha)
-    return track.absolute(_posed(model, network, params, garment_blend(network, params, model), track.matrices, z))
+    codes, weights = network.codes(params, model, track), garment_blend(network, params, model)
+    x = _posed(model, network, params, weights, track.matrices, codes.together(alpha), codes.swung(alpha))
+    return track.absolute(x)
 
 
 def first_broken(model: Model, network: Method, params: dict, track: Track, alpha: float = 1.0) -> str:
     """Of a motion whose vertices are not all finite: the first frame of which something is not, what, and its vertex."""
-    codes = network.codes(params, track)
+    codes = network.codes(params, model, track)
     x = animate(model, network, params, track, alpha)
     stages = {
         "joint transforms": track.matrices,
         "static descriptors": track.static,
         "dynamic descriptors": track.dynamic,
         "static code": codes.static,
+        "swing": codes.swing,
         "dynamic code": codes.dynamic,
         "vertices": x,
     }

@@ -22,6 +22,7 @@ from ncs_jax.compression import compress
 from ncs_jax.devices import batch_mesh, compiled, copied, divided, give_back, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
+from ncs_jax.methods.swing import Swing
 from ncs_jax.motion import Track
 from ncs_jax.rollout import animate, first_broken
 from ncs_jax.scene import Scene, load_scene, scene_from
@@ -177,6 +178,14 @@ def train(
         out = report = None
     look = jax.jit(lambda model, params, track, ends: glance(model, network, spec.window, params, track, ends))
     frames = track.start.shape[0]
+    motions, swings = track, jax.jit(network.swings) if isinstance(network, Swing) else None
+
+    def look_at_swings(params):
+        """Tell the motions what swings the network gives now, if it has any."""
+        nonlocal track, everywhere
+        if swings is not None:
+            q = swings(params, model, motions)
+            track, everywhere = replace(track, swing=q), (everywhere[0], replace(everywhere[1], swing=copied(mesh, q)))
 
     def indices(first, count):
         ends = batches(frames, spec.batch, seed, first, count)
@@ -197,6 +206,7 @@ def train(
         return programs[count](*arguments)
 
     state = initial_state(model, network, seed)
+    look_at_swings(state.params)
     if facts is None:  # before anything is written: whether it fits into memory
         prepared(0, CHUNK if minutes is not None else min(CHUNK, steps or spec.steps), copied(mesh, state), 0)
     if out is not None and facts is None:
@@ -233,6 +243,7 @@ def train(
         state = checkpoints.restore(state)
     state = copied(mesh, state)
     first = int(state.step)
+    look_at_swings(local(mesh, state.params))
     log = None if out is None else _Log(out, first)
     dropped, started, pace = int(state.dropped), time.monotonic(), None
     for at, count in chunks(first, steps):
@@ -270,6 +281,8 @@ def train(
             report(entry)
         if checkpoints is not None and (done % every == 0 or done == steps):
             checkpoints.save(done, here)
+        if done % every == 0:  # where a run that is resumed begins
+            look_at_swings(here.params)
     if checkpoints is not None:
         checkpoints.close()
     if log is not None:

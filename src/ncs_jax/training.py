@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
 from ncs_jax.methods.shared import Method, decode, garment_blend, initial_parameters
+from ncs_jax.methods.swing import LARGEST, MIXED, Swing
 from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
@@ -203,14 +204,14 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
     """
     model = replace(model, terms=network.loss(model.terms))
     history = 3 if model.terms.inertia else 1
-    augmented = round(spec.motion_augmentation * spec.batch) if network.controlled else 0
+    augmented = round(spec.motion_augmentation * spec.batch) if network.controlled and not isinstance(network, Swing) else 0
     number = jnp.arange(ends.shape[0], dtype=ends.dtype)  # in the whole batch
     if axis is not None:
         number = number + lax.axis_index(axis) * ends.shape[0]
     own = number >= augmented
 
     def codes(params):
-        z_static, z_dynamic = network.windows(params, track, ends, spec.window, history)
+        z_static, z_dynamic, _ = network.windows(params, track, ends, spec.window, history)
         if z_dynamic is None:
             return z_static
         if not augmented:
@@ -222,7 +223,22 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
         swapped = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
         return jnp.concatenate([swapped, (z_static + z_dynamic)[:, augmented:]], axis=1)
 
+    def swung(network, params):
+        """Offsets with a swing, its own or that of another window, and what they are beyond the static ones."""
+        mixed = round(MIXED * spec.batch)
+        everyone = ends if axis is None else lax.all_gather(ends, axis, tiled=True)
+        share = LARGEST * number.astype(track.swing.dtype) / max(mixed - 1, 1)
+        at, share = jnp.where(number < mixed, everyone[pairs], ends), jnp.where(number < mixed, share, 1)
+        found = network.mixed(params, track, ends, at, share)
+        z = found.together()
+        offsets = decode(network, params, model, jnp.concatenate([z, lax.stop_gradient(found.static)]))
+        offsets, static = jnp.split(offsets, 2, axis=-1)
+        moved = offsets - lax.stop_gradient(static)
+        return [offsets + jnp.tensordot(model.vibrations.directions, found.swing, (-1, -1)), moved], z[None]
+
     def decoded(params):
+        if isinstance(network, Swing):
+            return swung(network, params)
         z = codes(params)
         if not model.terms.through_time:
             return [decode(network, params, model, z[-1])], z
@@ -230,6 +246,8 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
         return [every[:, :, k] for k in (2, 1, 0)], z
 
     offsets, transpose, z = jax.vjp(decoded, params, has_aux=True)
+    if isinstance(network, Swing):
+        *offsets, moved = offsets
     if history > len(offsets):
         earlier = decode(network, params, model, z[:-1])
         offsets = [*offsets, earlier[:, :, 1], earlier[:, :, 0]]
@@ -240,6 +258,9 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
     share = own.astype(offsets[0].dtype)
     parts, g, to_weights = physics(model, weights, offsets, matrices, share, body)
     by_frame = [g]
+    if isinstance(network, Swing):
+        held, to_moved = network.hold(model, moved)
+        parts, by_frame = parts | {"hold": held}, [g, to_moved]
     if model.terms.through_time:
         past, more = _through_time(model, weights, offsets, matrices, share)
         by_frame, to_weights = by_frame + past, jax.tree.map(jnp.add, to_weights, more)
@@ -328,7 +349,7 @@ def glance(model: Model, network: Method, window: int, params, track: Track, end
     Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
     """
     codes = network.windows(params, track, ends, window, 1)
-    offsets = decode(network, params, model, codes.together()[-1])
+    offsets = decode(network, params, model, *(c if c is None else c[-1] for c in (codes.together(), codes.swung())))
     weights = garment_blend(network, params, model)
     mesh = model.garment.mesh
 

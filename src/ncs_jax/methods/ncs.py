@@ -56,7 +56,7 @@ class NCS:
         """All of them, inertia's target a constant: a minimum is a step of implicit Euler."""
         return terms
 
-    def step(self, params: dict, state: Array, static: Array, dynamic: Array | None) -> tuple[Array, Codes]:
+    def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
         """z_S of the frame, and z_D, which is the new state."""
         fixed = self._static(params, static)
         if self.dynamic is None:
@@ -66,7 +66,7 @@ class NCS:
         state = jnp.asarray(self.dynamic.apply(variables, state, features, method="step"))
         return state, Codes(fixed, state)
 
-    def codes(self, params: dict, track: Track) -> Codes:
+    def codes(self, params: dict, model: Model, track: Track) -> Codes:
         """z_S of every frame by itself, and z_D from rest at the motion's start."""
         fixed = self._static(params, track.static)
         if self.dynamic is None:

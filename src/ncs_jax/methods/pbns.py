@@ -42,11 +42,11 @@ class PBNS:
         """All but inertia, and friction, which knows of a frame before."""
         return replace(terms, inertia=False, friction=False)
 
-    def step(self, params: dict, state: Array, static: Array, dynamic: Array | None) -> tuple[Array, Codes]:
+    def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
         """The code of the frame's pose; nothing is carried."""
         return state, self._of(params, static)
 
-    def codes(self, params: dict, track: Track) -> Codes:
+    def codes(self, params: dict, model: Model, track: Track) -> Codes:
         """Of every frame by itself."""
         return self._of(params, track.static)
 

@@ -20,14 +20,19 @@ __all__ = ["Codes", "Method", "decode", "descriptor_sizes", "for_inference", "ga
 
 
 class Codes(NamedTuple):
-    """z_S, and z_D where there is one."""
+    """z_S, z_D where there is one, and q, how far a garment swings along its vibrations, where it does."""
 
     static: Array
     dynamic: Array | None = None
+    swing: Array | None = None
 
     def together(self, alpha: float | Array | None = 1.0) -> Array:
         """z_S + alpha z_D (15); None leaves z_D out."""
         return self.static if self.dynamic is None or alpha is None else self.static + alpha * self.dynamic
+
+    def swung(self, alpha: float | Array | None = 1.0) -> Array | None:
+        """alpha q; None leaves it out."""
+        return None if self.swing is None or alpha is None else alpha * self.swing
 
 
 @runtime_checkable
@@ -61,13 +66,15 @@ class Method(Protocol):
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Fresh parameters of all but the decoder."""
 
-    def step(self, params: dict, state: Array, static: Array, dynamic: Array | None) -> tuple[Array, Codes]:
-        """One frame of any number of characters from its descriptors: the new state, and the codes."""
+    def step(
+        self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array
+    ) -> tuple[Array, Codes]:
+        """One frame of any number of characters, its descriptors and joint transforms: the new state, and the codes."""
 
     def loss(self, terms: Terms) -> Terms:
         """Of a scene's terms those that train it, and whether inertia's target carries a gradient."""
 
-    def codes(self, params: dict, track: Track) -> Codes:
+    def codes(self, params: dict, model: Model, track: Track) -> Codes:
         """Of every frame (frames, code) of one motion, from rest at its start."""
 
     def windows(self, params: dict, track: Track, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
@@ -99,9 +106,18 @@ def garment_blend(network: Method, params: dict, model: Model) -> Blend:
     return Blend(scaled / jnp.sum(scaled, axis=-1, keepdims=True), model.blend.joints)
 
 
-def decode(network: Method, params: dict, model: Model, code: Float[Array, "*frames code"]) -> Float[Array, "verts 3 *frames"]:
-    """Offsets in unposed space, m."""
-    return jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
+def decode(
+    network: Method,
+    params: dict,
+    model: Model,
+    code: Float[Array, "*frames code"],
+    swing: Float[Array, "*frames modes"] | None = None,
+) -> Float[Array, "verts 3 *frames"]:
+    """Offsets in unposed space, m: those of the code, and those of a swing along the model's vibrations."""
+    offsets = jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
+    if swing is None:
+        return offsets
+    return offsets + jnp.tensordot(model.vibrations.directions, swing, (-1, -1))
 
 
 def for_inference(network: Any, params: dict, model: Model) -> tuple[Any, dict]:

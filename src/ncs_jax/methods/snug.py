@@ -49,14 +49,14 @@ class SNUG:
         """All of them, inertia's target differentiated too."""
         return replace(terms, through_time=terms.inertia)
 
-    def step(self, params: dict, state: Array, static: Array, dynamic: Array | None) -> tuple[Array, Codes]:
+    def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
         """The code of the frame, which is the new state."""
         variables = {"params": params["recurrent"]}
         features = self.recurrent.apply(variables, self._read(static, dynamic), method="features")
         state = jnp.asarray(self.recurrent.apply(variables, state, features, method="step"))
         return state, Codes(state)
 
-    def codes(self, params: dict, track: Track) -> Codes:
+    def codes(self, params: dict, model: Model, track: Track) -> Codes:
         """From a state of zero at the motion's start."""
         rest = jnp.zeros(self.state, track.static.dtype)
         inputs = self._read(track.static, track.dynamic)

@@ -22,8 +22,8 @@ from ncs_jax.solver.cholesky import Elimination, factorise
 from ncs_jax.solver.contact import Contact, touching
 from ncs_jax.solver.stiffness import Couplings, stiffness
 
-__all__ = ["Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored", "imbalance",
-           "knowing", "look", "looked", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
+__all__ = ["STATIC", "Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored",
+           "imbalance", "knowing", "look", "looked", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
 STATIC = 1 / 30  # s: the time step that damps the way to a static state, where the frame's own is shorter

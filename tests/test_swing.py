@@ -1,0 +1,220 @@
+"""A swing: the garment's own vibrations, what implicit Euler makes of them, and how a network is trained for them."""
+
+import shutil
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax import InputError, assemble, load_run, train
+from ncs_jax.assembly import track_of
+from ncs_jax.kinematics import blend, skin
+from ncs_jax.methods.swing import Swing
+from ncs_jax.model import local_rotations, pose_body
+from ncs_jax.objective import Frame, total
+from ncs_jax.rollout import animate, stepper
+from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.simulator import simulate, simulator_from
+from ncs_jax.training import gradients, initial_state
+from ncs_jax.vibration import softest
+
+from .scenes import grid, write_scene
+from .test_rollout import edited, ready, run
+from .test_training import prepared
+
+SWING = {"network.cell": "swing", "network.vibrations": 3, "garment.pins": "pins"}
+
+
+def hanging(tmp_path, rows=12, columns=3, size=0.05):
+    """A strip of cloth with nothing beside it that hangs from its upper edge."""
+    vertices, faces = grid(rows, columns, size)
+    top = np.arange(len(vertices))[-columns:]
+    np.savez(tmp_path / "cloth.npz", vertices=vertices, faces=faces, group_pins=top)
+    np.savez(tmp_path / "still.npz", poses=np.zeros((2, 1, 3)), trans=np.zeros((2, 3)), fps=np.array(30.0))
+    (tmp_path / "scene.toml").write_text(
+        '[body]\nfile = "none"\n[garment]\nfile = "cloth.npz"\npins = "pins"\n[motion]\nfiles = ["still.npz"]\n'
+        "[network]\nmodes = 0\n[physics.bending]\nstiffness = 0\n[physics.pinning]\nstiffness = 1e6\n"
+    )
+    return assemble(load_scene(tmp_path / "scene.toml"), dtype=jnp.float64)
+
+
+def test_a_hanging_strip_swings_as_a_chain_does(tmp_path):
+    """Forward, and twisting: its threads are chains side by side, w = j_01 / 2 sqrt(g / L), j_01 the Bessel function's zero."""
+    assembly = hanging(tmp_path, 23, 5, 0.025)
+    model = assembly.model  # of cloth that does not stretch, as chains do not
+    model = replace(model, material=replace(model.material, membrane=tuple(30 * k for k in model.material.membrane)))
+    found = softest(model, assembly.track, 2)
+    mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)
+    moved = np.einsum("v,vik->ik", mass, np.square(found.directions))
+    assert (moved[2] > 0.999 * moved.sum(axis=0)).all()
+    frequency = np.sqrt(float(found.energy) / moved.sum(axis=0))
+    np.testing.assert_allclose(frequency, 2.404826 / 2 * np.sqrt(9.81 / np.ptp(model.garment.mesh.rest[:, 1])), rtol=0.01)
+
+
+def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
+    """Orthogonal in mass and in stiffness, each of the same energy, as the second derivative of all terms has it."""
+    assembly = hanging(tmp_path, 8)
+    model, track, terms = assembly.model, assembly.track, replace(assembly.model.terms, inertia=False)
+    found = softest(model, track, 3)
+    simulator = simulator_from(model)
+    (x,), _ = jax.jit(simulate)(simulator, jax.tree.map(lambda a: a[:1], track))
+    blended = blend(track.matrices[0], model.blend)
+    frame = Frame(1 / model.fps, blended=blended)
+    u = jnp.einsum("vij,vjk->vik", blended[:, :, :3], found.directions)
+
+    def along(q):
+        return total(x + jnp.tensordot(u, q, 1), model.garment, model.material, frame, terms)
+
+    hessian = jax.hessian(along)(jnp.zeros(3))
+    np.testing.assert_allclose(hessian, float(found.energy) * np.eye(3), rtol=0.02, atol=0.02 * float(found.energy))
+    mass = model.material.density * model.garment.mesh.vertex_area
+    moved = np.asarray(jnp.einsum("v,vik,vil->kl", mass, u, u))
+    np.testing.assert_allclose(moved - np.diag(np.diag(moved)), 0, atol=1e-9 * moved.max())
+    assert np.all(np.diff(np.diag(moved)) < 0)  # softest first
+
+
+def test_a_swing_is_implicit_euler_along_the_vibrations(tmp_path):
+    """Every frame minimises inertia about its own two frames before, and the energy of the vibrations."""
+    assembly, params, motion = ready(tmp_path, method="swing")
+    model, network, track = assembly.model, replace(assembly.network, damping=0.0), track_of(assembly.model, motion)
+    q = np.asarray(network.swings(params, model, track))
+    static = np.asarray(animate(model, network, params, track, None))
+    mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)
+    turned = np.asarray(jax.vmap(lambda m: blend(m, model.blend))(track.matrices))[..., :3]
+    p = np.einsum("fvij,vjk->fvik", turned, model.vibrations.directions)
+    x = static + np.einsum("fvik,fk->fvi", p, q)
+    assert not q[0].any() and np.abs(q).max() > 0.05
+    for t in range(1, len(q)):
+        away = x[t] - 2 * x[t - 1] + x[max(t - 2, 0)]
+        force = np.einsum("vik,v,vi->k", p[t], mass, away) * model.fps**2 + float(model.vibrations.energy) * q[t]
+        np.testing.assert_allclose(force, 0, atol=1e-9 * float(model.vibrations.energy))
+
+
+def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped(tmp_path):
+    assembly, params, motion = ready(tmp_path, method="swing")
+    still = 300
+    poses, places = (np.concatenate([a, np.repeat(a[-1:], still, axis=0)]) for a in (motion.poses, motion.translation))
+    track, model = track_of(assembly.model, edited(motion, poses, places)), assembly.model
+    left = []
+    for damping in (0.0, 2.0):
+        q = np.asarray(replace(assembly.network, damping=damping).swings(params, model, track))[-still:, 0]
+        crossings = np.flatnonzero(np.diff(np.sign(q[:60])))
+        assert len(crossings) > 2
+        left.append(np.abs(q[60:90]).max() / np.abs(q[:30]).max())
+        assert np.abs(q[-30:]).max() < 1e-3 * np.abs(q).max()
+    assert left[1] < 0.5 * left[0] < 0.5
+
+
+def test_no_motion_no_swing_and_motions_end_to_end_know_nothing_of_each_other(tmp_path):
+    assembly, params, motion = ready(tmp_path, method="swing")
+    model, network = assembly.model, assembly.network
+    still = edited(motion, np.repeat(motion.poses[3:4], 40, axis=0), np.repeat(motion.translation[3:4], 40, axis=0))
+    codes = network.codes(params, model, track_of(model, still))
+    assert np.abs(codes.swing).max() < 1e-12 and np.abs(codes.dynamic).max() < 1e-12
+    once = network.swings(params, model, track_of(model, motion))
+    every = network.swings(params, model, track_of(model, motion, still, motion))
+    np.testing.assert_allclose(every, jnp.concatenate([once, jnp.zeros((40, 3)), once]), rtol=0, atol=1e-12)
+
+
+def test_alpha_scales_the_swing_and_the_code_that_goes_with_it(tmp_path):
+    assembly, params, motion = ready(tmp_path, method="swing")
+    network, codes = assembly.network, assembly.network.codes(params, assembly.model, track_of(assembly.model, motion))
+    np.testing.assert_allclose(network._dynamic(params, 3.0 * codes.swing), 3.0 * codes.dynamic, rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(codes.swung(3.0), 3.0 * codes.swing)
+    moved = [np.abs(run(assembly, params, motion, alpha) - run(assembly, params, motion, 0.0)).max() for alpha in (1.0, 2.0)]
+    assert moved[1] > 1.3 * moved[0] > 1e-3
+
+
+def test_far_from_the_origin_a_stream_in_single_precision_swings_as_near_it(tmp_path):
+    assembly, params, motion = ready(tmp_path, jnp.float32, "swing")
+    model = assembly.model
+    init, step = stepper(model, assembly.network, params)
+    local, step = local_rotations(model, jnp.asarray(motion.poses, jnp.float32)), jax.jit(step)
+    ends = []
+    for far in (0.0, 1024.0):
+        state = init()
+        for rotations, place in zip(local, motion.translation.astype(np.float32), strict=True):
+            state, x = step(state, rotations, jnp.asarray(place + np.float32(far)))
+        ends.append(np.asarray(x, np.float64) - far)
+    assert np.abs(ends[1] - ends[0]).max() < 1e-3  # 1,024 m has no places finer than 0.06 mm
+
+
+def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
+    """Of all that a step computes in pieces, in one: with other frames' swings too."""
+    assembly, spec, ends, _ = prepared(tmp_path, SWING, jnp.float64)
+    model, network, ends = assembly.model, assembly.network, ends[0]
+    params = initial_state(model, network, 0).params
+    params["dynamic"]["read"]["kernel"] = params["dynamic"]["read"]["kernel"] * 100
+    params["decoder"]["coefficients"]["kernel"] = params["decoder"]["coefficients"]["kernel"] + 0.01
+    pairs = jnp.asarray([2, 0, 3, 1], jnp.int32)
+    track = replace(assembly.track, swing=network.swings(params, model, assembly.track))
+    share = jnp.asarray([0.0, 1.5, 1.0, 1.0])
+    others = jnp.concatenate([ends[pairs[:2]], ends[2:]])
+    fixed = network.mixed(params, track, ends, others, share).static
+    terms, rest = network.loss(model.terms), model.garment.mesh.rest
+    mass, d = model.material.density * model.garment.mesh.vertex_area, model.vibrations.directions
+
+    def decoded(params, z):
+        return network.decoder.apply({"params": params["decoder"]}, z, model.basis)
+
+    still = decoded(params, fixed)
+
+    def loss(params):
+        codes = network.mixed(params, track, ends, others, share)
+        y = decoded(params, codes.together())
+        value = 0.0
+        for i in range(len(ends)):
+            m = track.matrices[ends[i]]
+            blended = blend(m, model.blend)
+            x = skin(blended, rest + y[..., i] + d @ (share[i] * track.swing[others[i]]))
+            body = None if model.body is None else pose_body(model, m)
+            frame = Frame(1 / model.fps, body=body, blended=blended)
+            value += total(x, model.garment, model.material, frame, terms, model.surface)
+            c = jnp.einsum("vik,v,vi->k", d, mass, y[..., i] - still[..., i])
+            value += 0.5 * model.fps**2 * jnp.sum(c * c / jnp.einsum("vik,v,vik->k", d, mass, d))
+        return value / len(ends)
+
+    value, expected = jax.value_and_grad(loss)(params)
+    found, parts, _ = jax.jit(lambda p: gradients(model, network, spec, p, track, ends, pairs))(params)
+    assert set(parts) == {"bending", "collision", "gravity", "hold", "membrane", "pinning"} and parts["hold"].max() > 1e-9
+    np.testing.assert_allclose(sum(parts.values()).mean(), value, rtol=1e-10)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * (1 + np.abs(b).max())), found, expected)
+
+
+def test_training_resuming_and_coming_back(tmp_path, plain_jax):
+    """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference."""
+    tables = load_scene(write_scene(tmp_path)).to_dict()
+    tables["network"] |= {"cell": "swing", "vibrations": 3}
+    tables["garment"]["pins"] = "pins"
+    scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
+
+    made = train(scene, tmp_path / "run", steps=40, report=reports.append)
+    fresh = replace(made, params=initial_state(made.assembly.model, made.assembly.network, 0).params)
+    before, after = (run.evaluate(scene.motion.files[0])["total"].mean() for run in (fresh, made))
+    assert after < before and reports[-1].moved > 1 and not any(r.dropped for r in reports)
+    again = load_run(tmp_path / "run")
+    assert isinstance(again.assembly.network, Swing)
+    motion = scene.motion.files[0]
+    np.testing.assert_array_equal(again.animate(motion), made.animate(motion))
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "40")
+    resumed = train(scene, tmp_path / "run", resume=True)
+    jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
+
+
+def test_a_run_of_an_earlier_version_still_loads(tmp_path, plain_jax):
+    train(write_scene(tmp_path), tmp_path / "run", steps=10)
+    with np.load(tmp_path / "run" / "prepared.npz") as kept:
+        arrays = {name: kept[name] for name in kept if name not in ("vibrations", "energy")}
+    np.savez(tmp_path / "run" / "prepared.npz", **arrays)
+    assert load_run(tmp_path / "run").assembly.model.vibrations is None
+
+
+def test_cloth_that_hangs_on_nothing_is_refused(tmp_path):
+    tables = load_scene(write_scene(tmp_path)).to_dict()
+    tables["network"]["cell"], tables["body"]["file"] = "swing", "none"
+    np.savez(tmp_path / "still.npz", poses=np.zeros((3, 1, 3)), trans=np.arange(9.0).reshape(3, 3) / 100, fps=np.array(30.0))
+    tables["motion"] |= {"files": ["still.npz"], "validation": []}
+    with pytest.raises(InputError, match="hangs on something"):
+        assemble(scene_from(tables, source=str(tmp_path / "scene.toml")))
