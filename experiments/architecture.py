@@ -22,7 +22,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.study import COLUMNS, apart, axes_of, changed, command, fitted, judged_on, trained, without, write
+from experiments.study import (
+    COLUMNS,
+    apart,
+    axes_of,
+    changed,
+    command,
+    fitted,
+    judged_on,
+    recurrent,
+    trained,
+    without,
+    write,
+)  # fmt: skip
 from ncs_jax import Run, Scene
 from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
@@ -161,10 +173,9 @@ def rest(run: Run, motion: str) -> dict:
 
 def measured(scene: Scene, network: str | Callable, unseen: Sequence[str], steps: int, kept: Path) -> dict:
     """Train a network and measure it."""
-    if isinstance(network, str):
-        run, minutes = trained(changed(scene, network={"cell": network}), steps, kept)
-    else:
-        run, minutes = fitted(scene, network, steps)
+    cell = network if isinstance(network, str) else "gated"
+    scene = changed(scene, network={"cell": cell}) if cell == "swing" else recurrent(scene, cell)
+    run, minutes = trained(scene, steps, kept) if isinstance(network, str) else fitted(scene, network, steps)
     found = judged_on(run, unseen, [run.animate(motion) for motion in unseen], kept)
     return found | {"minutes": minutes} | rest(run, unseen[0])
 

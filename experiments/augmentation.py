@@ -22,9 +22,10 @@ SHARES = (0.25, 0.5)
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
-    scenes = {"none": changed(scene, training={"motion_augmentation": 0.0}, motion={"mirror": False})}
-    scenes |= {f"motion, {share:g} of a batch": changed(scene, training={"motion_augmentation": share}) for share in SHARES}
-    scenes["mirror"] = changed(scene, motion={"mirror": True})
+    none = changed(scene, training={"motion_augmentation": 0.0}, motion={"mirror": False})
+    scenes = {"none": none}
+    scenes |= {f"motion, {share:g} of a batch": changed(none, training={"motion_augmentation": share}) for share in SHARES}
+    scenes["mirror"] = changed(none, motion={"mirror": True})
     rows = networks(scenes, unseen, steps, kept, "augmentation")
     write(out, "augmentation", rows, {"augmentation": "", **COLUMNS})
     bars(out / "augmentation.png", rows, "augmentation", {key: COLUMNS[key] for key in ("total", "dynamic_share", "distance")})

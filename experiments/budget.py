@@ -2,8 +2,8 @@
 
     python -m experiments.budget [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
 
-Windows, batches and numbers of motions are changed one at a time from the scene's own and trained for as many steps. Writes
-budget.csv, .md and .png.
+Windows (of a gated unit), batches and numbers of motions are changed one at a time from the scene's own and trained for as
+many steps. Writes budget.csv, .md and .png.
 """
 
 from __future__ import annotations
@@ -14,7 +14,20 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from experiments.study import COLUMNS, apart, bars, changed, command, judged, networks, reference, trained, without, write
+from experiments.study import (
+    COLUMNS,
+    apart,
+    bars,
+    changed,
+    command,
+    judged,
+    networks,
+    recurrent,
+    reference,
+    trained,
+    without,
+    write,
+)
 from ncs_jax import Scene, assemble
 
 WINDOWS, BATCHES, RATES = (5, 15, 30), (8, 32, 64), (15.0, 30.0, 60.0)
@@ -36,7 +49,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
     files = scene.motion.files
-    scenes = {f"window of {n}": changed(scene, training={"window": n}) for n in WINDOWS}
+    scenes = {f"window of {n}": changed(recurrent(scene), training={"window": n}) for n in WINDOWS}
     scenes |= {f"batch of {n}": changed(scene, training={"batch": n}) for n in BATCHES}
     counts = sorted({min(n, len(files)) for n in (1, 3, len(files))})
     # the last ones, which move most

@@ -2,9 +2,9 @@
 
     python -m experiments.descriptors [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
 
-Each is trained on the scene's motions but the unseen ones, and measured on the first of those, on the last it was trained on,
-and on the first unseen one turned about gravity: by how many mm the result differs from the turned result. Writes
-descriptors.csv, .md and .png.
+Each is trained, with a gated unit, on the scene's motions but the unseen ones, and measured on the first of those, on the last
+it was trained on, and on the first unseen one turned about gravity: by how many mm the result differs from the turned result.
+Writes descriptors.csv, .md and .png.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.study import apart, bars, changed, command, fitted, judged, reference, trained, without, write
+from experiments.study import apart, bars, changed, command, fitted, judged, recurrent, reference, trained, without, write
 from ncs_jax import Run, Scene, local_rotations
 from ncs_jax.descriptors import DESCRIPTORS
 from ncs_jax.methods.ncs import NCS
@@ -95,7 +95,7 @@ def measured(scene: Scene, unseen: str, steps: int, kept: Path, blind: bool) -> 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
-    scene = without(scene, unseen)
+    scene = recurrent(without(scene, unseen))
     rows = []
     for name, blind in (*((name, False) for name in DESCRIPTORS), ("six", True)):
         row = apart(measured, changed(scene, network={"descriptor": name}), unseen[0], steps, kept, blind)

@@ -18,17 +18,18 @@ from pathlib import Path
 import numpy as np
 
 from experiments.speed_accuracy import streamed
-from experiments.study import COLUMNS, apart, changed, command, judged_on, reference, trained, without, write
+from experiments.study import COLUMNS, apart, changed, command, judged_on, recurrent, reference, trained, without, write
 from ncs_jax import Run, Scene, assemble
 
 METHODS = ("pbns", "snug", "ncs")
+RECURRENT = "ncs, gated"  # beside NCS with the garment's own swing, if that is the scene's
 
 
-def learned(scene: Scene, unseen: Sequence[str], steps: int, kept: Path) -> tuple[dict, list[np.ndarray]]:
-    """Train the scene's method: its row, and its animations of the unseen motions."""
+def learned(name: str, scene: Scene, unseen: Sequence[str], steps: int, kept: Path) -> tuple[dict, list[np.ndarray]]:
+    """Train the scene's method: its row, so named, and its animations of the unseen motions."""
     run, minutes = trained(scene, steps, kept)
     found = [run.animate(motion) for motion in unseen]
-    row = {"method": scene.network.method, **judged_on(run, unseen, found, kept), "minutes": minutes}
+    row = {"method": name, **judged_on(run, unseen, found, kept), "minutes": minutes}
     return row | {"frame": 1e3 * streamed(run, unseen[0])}, found
 
 
@@ -42,8 +43,11 @@ def simulated(scene: Scene, unseen: Sequence[str], kept: Path) -> tuple[dict, li
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path, name: str = "methods") -> list[dict]:
     """Measure all four, write the table and the strips into `out`, and return the rows."""
     scene = without(scene, unseen)
+    scenes = {method: changed(scene, network={"method": method}) for method in METHODS}
+    if scene.network.cell == "swing":
+        scenes[RECURRENT] = recurrent(scenes["ncs"])
     made = [apart(simulated, scene, unseen, kept)]
-    made += [apart(learned, changed(scene, network={"method": method}), unseen, steps, kept) for method in METHODS]
+    made += [apart(learned, method, one, unseen, steps, kept) for method, one in scenes.items()]
     rows = [row for row, _ in made]
     write(out, name, rows, {"method": "", **COLUMNS, "lag": "lag, s", "frame": "ms a frame"})
     run = Run(assemble(scene), {})
@@ -89,6 +93,11 @@ def conclusion(rows: Sequence[dict]) -> str:
     if "stopped_share" in ncs:
         text += f"; after a stop NCS still moves ({ncs['stopped_share']:.2f}), PBNS stands ({pbns['stopped_share']:.2f})"
         text += f", and NCS settles in {ncs['settling']:.2f} s where the simulation takes {sim['settling']:.2f} s"
+    if RECURRENT in by:
+        gated = by[RECURRENT]
+        text += f". With a gated unit in place of the swing: {gated['dynamic_share']:.2f}"
+        if "stopped_share" in gated:
+            text += f", {gated['stopped_share']:.2f} after the stop"
     return text + "."
 
 

@@ -59,6 +59,11 @@ def without(scene: Scene, unseen: Sequence[str]) -> Scene:
     return changed(scene, motion={"files": tuple(name for name in scene.motion.files if name not in unseen), "validation": ()})
 
 
+def recurrent(scene: Scene, cell: str = "gated") -> Scene:
+    """The scene whose network remembers by a recurrence, which only its own motion trains."""
+    return changed(scene, network={"cell": cell}, training={"motion_augmentation": 0.0})
+
+
 def named(*told: Any) -> str:
     """A name of anything that JSON can tell, for a file."""
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]

@@ -24,7 +24,7 @@ from .scenes import grid, write_scene
 from .test_rollout import edited, ready, run
 from .test_training import prepared
 
-SWING = {"network.cell": "swing", "network.vibrations": 3, "garment.pins": "pins"}
+SWING = {"network.cell": "swing", "network.vibrations": 3, "garment.pins": "pins", "training.motion_augmentation": 0.5}
 
 
 def hanging(tmp_path, rows=12, columns=3, size=0.05):
@@ -187,6 +187,7 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax):
     """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference."""
     tables = load_scene(write_scene(tmp_path)).to_dict()
     tables["network"] |= {"cell": "swing", "vibrations": 3}
+    tables["training"]["motion_augmentation"] = 0.5
     tables["garment"]["pins"] = "pins"
     scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
 

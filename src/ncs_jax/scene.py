@@ -162,7 +162,7 @@ class TrainingSpec:
     batch: int = _f(32, "windows a step", low=1, high=65536)
     window: int = _f(11, "frames a window", low=1, high=10000)
     learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
-    motion_augmentation: float = _f(0.0, "share of a batch with another window's dynamic code", low=0, high=1)
+    motion_augmentation: float = _f(0.0, "share of a batch with another window's motion", low=0, high=1)
     validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)
     checkpoint_every: int = _f(200, "steps between checkpoints", low=1, high=10_000_000)
     seed: int = _f(0, "seed of all that is random", low=0, high=2**31 - 1)

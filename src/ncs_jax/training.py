@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
 from ncs_jax.methods.shared import Method, decode, garment_blend, initial_parameters
-from ncs_jax.methods.swing import LARGEST, MIXED, Swing
+from ncs_jax.methods.swing import LARGEST, Swing
 from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
@@ -204,7 +204,8 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
     """
     model = replace(model, terms=network.loss(model.terms))
     history = 3 if model.terms.inertia else 1
-    augmented = round(spec.motion_augmentation * spec.batch) if network.controlled and not isinstance(network, Swing) else 0
+    swapped = round(spec.motion_augmentation * spec.batch) if network.controlled else 0
+    augmented = 0 if isinstance(network, Swing) else swapped  # no inertia of theirs
     number = jnp.arange(ends.shape[0], dtype=ends.dtype)  # in the whole batch
     if axis is not None:
         number = number + lax.axis_index(axis) * ends.shape[0]
@@ -220,15 +221,14 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
         if axis is not None:  # any number of this device's windows are such, and the others' codes may be elsewhere
             everyone = lax.all_gather(lax.stop_gradient(z_dynamic), axis, axis=1, tiled=True)
             return jnp.where(own[:, None], z_static + z_dynamic, lax.stop_gradient(z_static) + everyone[:, pairs])
-        swapped = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
-        return jnp.concatenate([swapped, (z_static + z_dynamic)[:, augmented:]], axis=1)
+        mixed = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, pairs[:augmented]])
+        return jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
 
     def swung(network, params):
         """Offsets with a swing, its own or that of another window, and what they are beyond the static ones."""
-        mixed = round(MIXED * spec.batch)
         everyone = ends if axis is None else lax.all_gather(ends, axis, tiled=True)
-        share = LARGEST * number.astype(track.swing.dtype) / max(mixed - 1, 1)
-        at, share = jnp.where(number < mixed, everyone[pairs], ends), jnp.where(number < mixed, share, 1)
+        share = LARGEST * number.astype(track.swing.dtype) / max(swapped - 1, 1)
+        at, share = jnp.where(number < swapped, everyone[pairs], ends), jnp.where(number < swapped, share, 1)
         found = network.mixed(params, track, ends, at, share)
         z = found.together()
         offsets = decode(network, params, model, jnp.concatenate([z, lax.stop_gradient(found.static)]))

@@ -75,7 +75,9 @@ def _drape(problem: Problem):
         diagonal, off = (np.asarray(block, np.float64) for block in found)
         if jnp.sqrt(jnp.sum(imbalance(near, point.gradient)) / mass) < ENOUGH[x.dtype]:
             break
-        p = splu(_matrix(problem, diagonal, off)).solve(-np.asarray(point.gradient, np.float64).ravel())
+        p = splu(_matrix(problem, diagonal, off), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(
+            -np.asarray(point.gradient, np.float64).ravel()
+        )
         x, moved = _descended(near, x, point, jnp.asarray(p.reshape(x.shape), x.dtype))
         if not moved:
             break

@@ -33,8 +33,7 @@ from ncs_jax.objective import Terms
 __all__ = ["Swing"]
 
 BLOCK = 32  # frames whose statics are posed together
-MIXED = 0.5  # share of a batch with the swing of another frame,
-LARGEST = 1.5  # from none of it to so much
+LARGEST = 1.5  # times another frame's swing is the most that motion augmentation puts on a pose; the least is none
 
 
 @dataclass(frozen=True)
