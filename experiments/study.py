@@ -7,6 +7,7 @@ import csv
 import hashlib
 import json
 import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -135,6 +136,11 @@ def networks(scenes: dict[str, Scene], motions: Sequence[str], steps: int, kept:
     return [{what: name, **apart(network, scene, motions, steps, kept)} for name, scene in scenes.items()]
 
 
+def keep_programs(kept: Path) -> None:
+    """What one process (`apart`) compiles, the later ones read from the folder."""
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(kept.resolve() / "programs"))
+
+
 def apart(job: Callable, *arguments: Any) -> Any:
     """What a function of a module returns, from a process of its own: its memory and its programs are gone afterwards."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as alone:
@@ -168,10 +174,11 @@ def command(name: str, doc: str | None, experiment: Callable, arguments: Sequenc
     parser.add_argument("--unseen", nargs="+", default=UNSEEN, metavar="MOTION", help="what none is trained on")
     parser.add_argument("--quick", action="store_true", help="20 steps, to try it out: the numbers mean nothing")
     parser.add_argument("--out", default=f"runs/{name}", help=f"folder for the table and the picture (default: runs/{name})")
-    parser.add_argument("--kept", default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")
+    parser.add_argument("--kept", type=Path, default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")
     o = parser.parse_args(arguments)
+    keep_programs(o.kept)
     try:
-        experiment(load_scene(o.scene), tuple(o.unseen), 20 if o.quick else o.steps, Path(o.out), Path(o.kept))
+        experiment(load_scene(o.scene), tuple(o.unseen), 20 if o.quick else o.steps, Path(o.out), o.kept)
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

@@ -17,6 +17,7 @@ from experiments import (
     methods,
     seeds,
     speed_accuracy,
+    spread,
     stability,
     study,
 )
@@ -131,6 +132,14 @@ def test_architecture(alone, tmp_path):
     for row in (ours, window, linear, swing):  # without bias, no motion is nothing
         assert float(row["before"]) < 1e-3 and float(row["left_2000"]) < 1e-3 < float(row["left_0"])
     assert float(bias["before"]) > 1e-3 < float(one["before"])
+
+
+@pytest.mark.slow
+def test_spread(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(spread, "SEEDS", 2)
+    one, two, between = studied(spread, tmp_path).values()
+    assert (one["seed"], two["seed"], between["seed"]) == ("0", "1", spread.RANGE)
+    assert 0 < float(between["total"]) == pytest.approx(abs(float(one["total"]) - float(two["total"])))
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ BELOW: dict[str, set[str]] = {
     "objective": {"energies", "kinematics", "mesh", "vectors"},
     "solver": {"energies", "mesh", "model", "numerics", "objective"},
     "simulator": {"energies", "kinematics", "model", "motion", "objective", "solver"},
-    "vibration": {"kinematics", "model", "motion", "solver"},
+    "vibration": {"kinematics", "model", "modes", "motion", "solver"},
     "model": {"energies", "kinematics", "objective", "rotations"},
     "motion": {"descriptors", "kinematics", "model"},
     "methods": {"descriptors", "kinematics", "model", "motion", "networks", "objective"},

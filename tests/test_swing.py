@@ -41,15 +41,15 @@ def hanging(tmp_path, rows=12, columns=3, size=0.05):
 
 
 def test_a_hanging_strip_swings_as_a_chain_does(tmp_path):
-    """Forward, and twisting: its threads are chains side by side, w = j_01 / 2 sqrt(g / L), j_01 the Bessel function's zero."""
+    """Forward: its threads are chains side by side, w = j_01 / 2 sqrt(g / L), j_01 the Bessel function's zero."""
     assembly = hanging(tmp_path, 23, 5, 0.025)
     model = assembly.model  # of cloth that does not stretch, as chains do not
     model = replace(model, material=replace(model.material, membrane=tuple(30 * k for k in model.material.membrane)))
-    found = softest(model, assembly.track, 2)
+    found = softest(model, assembly.track, 3)
     mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)
-    moved = np.einsum("v,vik->ik", mass, np.square(found.directions))
-    assert (moved[2] > 0.999 * moved.sum(axis=0)).all()
-    frequency = np.sqrt(float(found.energy) / moved.sum(axis=0))
+    moved = np.einsum("v,vik->ik", mass, np.square(found.directions))[:, 0]
+    assert moved[2] > 0.999 * moved.sum()
+    frequency = np.sqrt(float(found.energy) / moved.sum())
     np.testing.assert_allclose(frequency, 2.404826 / 2 * np.sqrt(9.81 / np.ptp(model.garment.mesh.rest[:, 1])), rtol=0.01)
 
 

@@ -286,7 +286,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
 
 
 def _vibrating(scene: Scene, prepared: Prepared, model: Model, faces, track: Track | None) -> Prepared:
-    """With the garment's softest vibrations: found with smooth contact, as a simulation converges with no other."""
+    """With the garment's vibrations: found with smooth contact, as a simulation converges with no other."""
     from ncs_jax.vibration import softest
 
     if faces is not None:

@@ -32,7 +32,7 @@ __all__ = [
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Vibrations:
-    """The softest movements of a garment about its drape, in unposed space: see `vibration.softest`.
+    """Movements of a garment about its drape, in unposed space: see `vibration.softest`.
 
     directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
     """

@@ -1,4 +1,4 @@
-"""The softest vibrations of a garment about its drape: what a swing is made of."""
+"""The vibrations of a garment about its drape: what a swing is made of."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.model import Model, Vibrations, pose_body
+from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track
-from ncs_jax.solver.problem import STATIC, Problem, blocks, descended, energy, evaluated, imbalance, knowing, look
+from ncs_jax.solver.problem import STATIC, Problem, blocks, descended, evaluated, imbalance, knowing, look
 from ncs_jax.solver.stiffness import couplings_from
 
 __all__ = ["softest"]
@@ -62,68 +63,71 @@ def _matrix(problem: Problem, diagonal, off):
     return (matrix + matrix.T) / 2
 
 
+def _solved(matrix, right):
+    """The solution of a positive definite system."""
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
+
+
 def _drape(problem: Problem):
-    """The static equilibrium x_0 by Newton's method, from cloth that is skinned; the problem and the blocks there.
+    """The problem and the blocks at the static equilibrium x_0, found by Newton's method from cloth that is skinned.
 
     What `simulator` does, on the host: that is slower a step, and has no factorisation of its own to compile.
     """
-    from scipy.sparse.linalg import splu
-
     x, mass = skin(problem.blended, problem.model.garment.mesh.rest), jnp.sum(problem.mass)
     for _ in range(STEPS):
         near, point, found = _evaluated(problem, x)
         diagonal, off = (np.asarray(block, np.float64) for block in found)
         if jnp.sqrt(jnp.sum(imbalance(near, point.gradient)) / mass) < ENOUGH[x.dtype]:
             break
-        p = splu(_matrix(problem, diagonal, off), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(
-            -np.asarray(point.gradient, np.float64).ravel()
-        )
+        p = _solved(_matrix(problem, diagonal, off), -np.asarray(point.gradient, np.float64).ravel())
         x, moved = _descended(near, x, point, jnp.asarray(p.reshape(x.shape), x.dtype))
         if not moved:
             break
-    return near, x, (diagonal, off)
-
-
-@jax.jit
-def _stiffness(problem: Problem, x, u):
-    """u^T K u of displacements (modes, verts, 3), with all that K has."""
-    forces = jax.lax.map(lambda one: jax.jvp(lambda x: jax.grad(energy, argnums=1)(problem, x), (x,), (one,))[1], u)
-    return jnp.einsum("kvi,lvi->kl", u, forces)
+    return near, diagonal, off
 
 
 def softest(model: Model, track: Track, count: int) -> Vibrations | None:
-    """The `count` softest vibrations about the drape x_0, the static equilibrium in the first frame of a track.
+    """The `count` softest vibrations of a garment among those that smooth inertia forces excite.
 
-        K u_i = w_i^2 M u_i,   K = d^2 E / dx^2 at x_0,   d_i = c_i R^-1 u_i
+    Such a force is a mass times a smooth mode b_j (`modes.modal_basis`) along an axis e_i. What it does to the drape x_0, the
+    static equilibrium in the first frame of a track, is a load-dependent Ritz vector u_ij; of those the vibrations are made:
 
-    R are the blended rotations of skinning there: the directions d_i (m) are those of unposed space. Each is scaled so that it
-    costs the same energy, d^T K d = E_0, the softest having a root mean square of `AMPLITUDE`. K holds the tension of the
-    cloth that hangs and what contact presses; without them a garment would have no period of its own. The u_i span
-    those of K made positive semi-definite, whose softest are no wrinkles but which is stiffer where cloth is compressed; K
-    itself combines and weighs them (Rayleigh and Ritz).
+        (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
+
+    K = d^2 E / dx^2 at x_0, as Newton's method has it, holds the tension of the cloth that hangs and what contact presses;
+    without them a garment would have no period of its own. s is `LEAST`'s. R are the blended rotations of skinning there: the
+    directions d_k (m) are those of unposed space. Each is scaled so that it costs the same energy, d^T K d = E_0, the softest
+    having a root mean square of `AMPLITUDE`. The softest vibrations of all would be those of single folds, which nothing
+    excites. Source: Wilson, Yuan and Dickens 1982.
 
     Returns:
         None where the garment hangs on nothing: a vibration is slower than `LEAST`.
     """
+    from scipy.linalg import eigh
     from scipy.sparse import diags
-    from scipy.sparse.linalg import eigsh
 
-    problem, x, (diagonal, off) = _drape(_still(model, track))
-    mass = np.asarray(problem.mass, np.float64)
+    problem, diagonal, off = _drape(_still(model, track))
+    mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
     added = mass / max(1 / model.fps, STATIC) ** 2  # by `blocks`
-    matrix = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3))
-    start = np.random.default_rng(0).normal(size=3 * n)  # ARPACK's own is random
-    masses = diags(np.repeat(mass, 3)).tocsc()
-    _, vectors = eigsh(matrix.tocsc(), count, masses, sigma=-1.0, which="LM", v0=start)
-    u = jnp.asarray(vectors.T.reshape(-1, n, 3), x.dtype)
-    squares, combined = np.linalg.eigh(np.asarray(_stiffness(problem, x, u), np.float64))
-    vectors = vectors @ combined
-    if squares[0] < (2 * np.pi * LEAST) ** 2:
+    stiff, masses = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3)), diags(np.repeat(mass, 3))
+    held = np.asarray(model.garment.pins) if model.terms.pinning else ()
+    rest, area = (np.asarray(a, np.float64) for a in (mesh.rest, mesh.vertex_area))
+    smooth = modal_basis(rest, np.asarray(mesh.faces), area, -(-count // 3), held=held)
+    if not smooth.size:
         return None
-    vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(count)] < 0, -1, 1)
+    least = (2 * np.pi * LEAST) ** 2
+    u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
+    squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
+    if squares[0] < least:
+        return None
+    squares, vectors = squares[:count], (u @ combined)[:, :count]
+    vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(squares))] < 0, -1, 1)
     energy = AMPLITUDE**2 * mass.sum() * squares[0]
-    u = (vectors * np.sqrt(energy / squares)).reshape(n, 3, count)
-    directions = np.linalg.solve(np.asarray(problem.blended, np.float64)[..., :3], u)
+    directions = np.linalg.solve(
+        np.asarray(problem.blended, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
+    )
     dtype = model.basis.dtype
     return Vibrations(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype))
