@@ -78,7 +78,7 @@ def benchmark(options) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         for times in TIMES if options.growth and not options.quick else TIMES[:1]:
             finest = finer(spec, Path(folder), garment=times)
-            assembly = assemble(replace(finest, network=replace(finest.network, modes=0)))
+            assembly = assemble(finest.without_network())
             for settings in solvers:
                 if options.growth:
                     settings = Settings(settings.solver, tolerance=1e-9, iterations=iterations, first=iterations)

@@ -16,16 +16,17 @@ from pathlib import Path
 from experiments.study import COLUMNS, bars, changed, command, networks, without, write
 from ncs_jax import Scene
 
-SHARES = (0.25, 0.5)
+# Share of a batch with another window's motion, and whether mirrored motions are added.
+CHOICES = {"none": (0.0, False), "motion": (0.5, False), "mirror": (0.0, True), "both": (0.5, True)}
 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
-    none = changed(scene, training={"motion_augmentation": 0.0}, motion={"mirror": False})
-    scenes = {"none": none}
-    scenes |= {f"motion, {share:g} of a batch": changed(none, training={"motion_augmentation": share}) for share in SHARES}
-    scenes["mirror"] = changed(none, motion={"mirror": True})
+    scenes = {
+        name: changed(scene, training={"motion_augmentation": share}, motion={"mirror": mirrored})
+        for name, (share, mirrored) in CHOICES.items()
+    }
     rows = networks(scenes, unseen, steps, kept, "augmentation")
     write(out, "augmentation", rows, {"augmentation": "", **COLUMNS})
     bars(out / "augmentation.png", rows, "augmentation", {key: COLUMNS[key] for key in ("total", "dynamic_share", "distance")})

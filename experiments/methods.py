@@ -36,7 +36,7 @@ def learned(name: str, scene: Scene, unseen: Sequence[str], steps: int, kept: Pa
 def simulated(scene: Scene, unseen: Sequence[str], kept: Path) -> tuple[dict, list[np.ndarray]]:
     """The simulation, judged like the others."""
     found = [reference(scene, motion, kept) for motion in unseen]
-    run = Run(assemble(scene), {})
+    run = Run(assemble(scene.without_network()), {})
     return {"method": "simulation", **judged_on(run, unseen, found, kept)}, found
 
 
@@ -50,7 +50,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     made += [apart(learned, method, one, unseen, steps, kept) for method, one in scenes.items()]
     rows = [row for row, _ in made]
     write(out, name, rows, {"method": "", **COLUMNS, "lag": "lag, s", "frame": "ms a frame"})
-    run = Run(assemble(scene), {})
+    run = Run(assemble(scene.without_network()), {})
     for k, motion in enumerate(unseen):
         file = out / f"{name}_{Path(motion.removeprefix('ncs:')).stem}.png"
         draw(file, run, motion, {row["method"]: animations[k] for row, animations in made})

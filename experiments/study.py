@@ -75,7 +75,7 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
 
     With smooth contact, as it does not converge with any other.
     """
-    smooth = changed(scene, physics={"collision": {"distance": "smooth"}}, network={"modes": 0})
+    smooth = changed(scene, physics={"collision": {"distance": "smooth"}})
     tables = smooth.to_dict()
     told = [motion, scene.motion.fps, *(tables[name] for name in ("body", "garment", "physics", "simulation"))]
     file = kept / "simulations" / f"{named(told)}.npz"

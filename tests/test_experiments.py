@@ -143,11 +143,10 @@ def test_spread(alone, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_augmentation(alone, tmp_path, monkeypatch):
-    monkeypatch.setattr(augmentation, "SHARES", (0.5,))
+def test_augmentation(alone, tmp_path):
     rows = studied(augmentation, tmp_path)
-    assert list(rows) == ["none", "motion, 0.5 of a batch", "mirror"]
-    assert len({row["total"] for row in rows.values()}) == 3
+    assert list(rows) == ["none", "motion", "mirror", "both"]
+    assert len({row["total"] for row in rows.values()}) == 4
 
 
 @pytest.mark.slow

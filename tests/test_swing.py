@@ -11,7 +11,7 @@ import pytest
 from ncs_jax import InputError, assemble, load_run, train
 from ncs_jax.assembly import track_of
 from ncs_jax.kinematics import blend, skin
-from ncs_jax.methods.swing import Swing
+from ncs_jax.methods.swing import HOLD, Swing
 from ncs_jax.model import local_rotations, pose_body
 from ncs_jax.objective import Frame, total
 from ncs_jax.rollout import animate, stepper
@@ -156,6 +156,8 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
     terms, rest = network.loss(model.terms), model.garment.mesh.rest
     mass, d = model.material.density * model.garment.mesh.vertex_area, model.vibrations.directions
 
+    moved = jnp.einsum("vik,v,vik->k", d, mass, d)
+
     def decoded(params, z):
         return network.decoder.apply({"params": params["decoder"]}, z, model.basis)
 
@@ -173,7 +175,7 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
             frame = Frame(1 / model.fps, body=body, blended=blended)
             value += total(x, model.garment, model.material, frame, terms, model.surface)
             c = jnp.einsum("vik,v,vi->k", d, mass, y[..., i] - still[..., i])
-            value += 0.5 * model.fps**2 * jnp.sum(c * c / jnp.einsum("vik,v,vik->k", d, mass, d))
+            value += 0.5 * HOLD * jnp.sum((moved * model.fps**2 + model.vibrations.energy) * (c / moved) ** 2)
         return value / len(ends)
 
     value, expected = jax.value_and_grad(loss)(params)
@@ -217,5 +219,8 @@ def test_cloth_that_hangs_on_nothing_is_refused(tmp_path):
     tables["network"]["cell"], tables["body"]["file"] = "swing", "none"
     np.savez(tmp_path / "still.npz", poses=np.zeros((3, 1, 3)), trans=np.arange(9.0).reshape(3, 3) / 100, fps=np.array(30.0))
     tables["motion"] |= {"files": ["still.npz"], "validation": []}
+    scene = scene_from(tables, source=str(tmp_path / "scene.toml"))
     with pytest.raises(InputError, match="hangs on something"):
-        assemble(scene_from(tables, source=str(tmp_path / "scene.toml")))
+        assemble(scene)
+    model = assemble(scene.without_network()).model  # a simulation asks for no vibrations, and for no modes
+    assert model.vibrations is None and not model.basis.size

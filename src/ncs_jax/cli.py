@@ -391,7 +391,7 @@ def _evaluate(options) -> int:
         if not options.scene:
             raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
         animation, scene = io.read_animation(target), load_scene(options.scene)
-        assembly = assemble(scene)
+        assembly = assemble(scene.without_network())
         names = (options.motion,) if options.motion else _default_motions(scene)
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")

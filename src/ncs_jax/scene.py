@@ -199,6 +199,10 @@ class Scene:
         path = Path(name).expanduser()
         return path if path.is_absolute() or not self.source else Path(self.source).parent / path
 
+    def without_network(self) -> Scene:
+        """The same with nothing that only a network needs, for a simulation or an animation that is there already."""
+        return dataclasses.replace(self, network=dataclasses.replace(self.network, method="pbns", modes=0))
+
     def to_dict(self) -> dict:
         """Plain tables, as in the file, with files as absolute paths, so that the scene can be rebuilt anywhere."""
         tables = dataclasses.asdict(self)

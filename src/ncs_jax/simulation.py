@@ -84,11 +84,10 @@ def simulate(
     if name is not None and not name.startswith("ncs:") and name not in named:
         name = str(Path(name).absolute())
     fine = scene.motion.fps * spec.substeps
-    # What can be touched is found out from this motion, and nothing is prepared for a network.
+    # What can be touched is found out from this motion.
     lone = replace(
-        scene,
+        scene.without_network(),
         motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False),
-        network=replace(scene.network, modes=0),
     )
     assembly = assemble(lone, dtype=dtype)
     model = assembly.model

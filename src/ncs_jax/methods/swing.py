@@ -33,6 +33,7 @@ from ncs_jax.objective import Terms
 __all__ = ["Swing"]
 
 BLOCK = 32  # frames whose statics are posed together
+HOLD = 3.0  # times the stiffness along a vibration, that of inertia and of the energy, is what holds it
 LARGEST = 1.5  # times another frame's swing is the most that motion augmentation puts on a pose; the least is none
 
 
@@ -145,14 +146,17 @@ class Swing:
     def hold(self, model: Model, moved: Float[Array, "verts 3 batch"]) -> tuple[Float[Array, "batch"], Array]:
         """What keeps the decoder from moving the garment along the swing, for that is the swing's, and its derivative.
 
-            1 / (2 h^2) sum_i (d_i^T M y)^2 / (d_i^T M d_i)
+            `HOLD` / 2 sum_i (g_i / h^2 + E_0) (d_i^T M y / g_i)^2,   g_i = d_i^T M d_i
+
+        Inertia and stiffness together, and more than once: held by less, a swing is lost to the energy that it costs.
 
         Args:
             moved: y, what the dynamic code adds to the offsets, m.
         """
         d, mass = model.vibrations.directions, _mass(model)
         along = (d * mass[:, None, None]).reshape(-1, self.modes)
-        weight = model.fps**2 / jnp.sum(along * d.reshape(along.shape), axis=0)
+        g = jnp.sum(along * d.reshape(along.shape), axis=0)
+        weight = HOLD * (g * model.fps**2 + model.vibrations.energy) / (g * g)
         c = along.T @ moved.reshape(len(along), -1)
         return jnp.sum(weight[:, None] * c * c, axis=0) / 2, (along @ (weight[:, None] * c)).reshape(moved.shape)
 
