@@ -234,18 +234,18 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
         offsets = decode(network, params, model, jnp.concatenate([z, lax.stop_gradient(found.static)]))
         offsets, static = jnp.split(offsets, 2, axis=-1)
         moved = offsets - lax.stop_gradient(static)
-        return [offsets + jnp.tensordot(model.vibrations.directions, found.swing, (-1, -1)), moved], z[None]
+        return [offsets + jnp.tensordot(model.vibrations.directions, found.swing, (-1, -1)), moved], (z[None], found.swing)
 
     def decoded(params):
         if isinstance(network, Swing):
             return swung(network, params)
         z = codes(params)
         if not model.terms.through_time:
-            return [decode(network, params, model, z[-1])], z
+            return [decode(network, params, model, z[-1])], (z, None)
         every = decode(network, params, model, z)
-        return [every[:, :, k] for k in (2, 1, 0)], z
+        return [every[:, :, k] for k in (2, 1, 0)], (z, None)
 
-    offsets, transpose, z = jax.vjp(decoded, params, has_aux=True)
+    offsets, transpose, (z, swing) = jax.vjp(decoded, params, has_aux=True)
     if isinstance(network, Swing):
         *offsets, moved = offsets
     if history > len(offsets):
@@ -259,7 +259,7 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
     parts, g, to_weights = physics(model, weights, offsets, matrices, share, body)
     by_frame = [g]
     if isinstance(network, Swing):
-        held, to_moved = network.hold(model, moved)
+        held, to_moved = network.hold(model, moved, swing)
         parts, by_frame = parts | {"hold": held}, [g, to_moved]
     if model.terms.through_time:
         past, more = _through_time(model, weights, offsets, matrices, share)

@@ -33,7 +33,6 @@ from ncs_jax.objective import Terms
 __all__ = ["Swing"]
 
 BLOCK = 32  # frames whose statics are posed together
-HOLD = 3.0  # times the stiffness along a vibration, that of inertia and of the energy, is what holds it
 LARGEST = 1.5  # times another frame's swing is the most that motion augmentation puts on a pose; the least is none
 
 
@@ -143,12 +142,15 @@ class Swing:
         q = share[:, None] * track.swing[others]
         return Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
 
-    def hold(self, model: Model, moved: Float[Array, "verts 3 batch"]) -> tuple[Float[Array, "batch"], Array]:
-        """What keeps the decoder from moving the garment along the swing, for that is the swing's, and its derivative.
+    def hold(
+        self, model: Model, moved: Float[Array, "verts 3 batch"], swing: Float[Array, "batch modes"]
+    ) -> tuple[Float[Array, "batch"], Array]:
+        """The inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
 
-            `HOLD` / 2 sum_i (g_i / h^2 + E_0) (d_i^T M y / g_i)^2,   g_i = d_i^T M d_i
+            sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i,   g_i = d_i^T M d_i
 
-        Inertia and stiffness together, and more than once: held by less, a swing is lost to the energy that it costs.
+        It is how inertia changes as the garment moves by r beyond q along the vibrations, for the q that implicit Euler gives.
+        Only what the linearised energy does not know of moves it then: the body, above all.
 
         Args:
             moved: y, what the dynamic code adds to the offsets, m.
@@ -156,9 +158,10 @@ class Swing:
         d, mass = model.vibrations.directions, _mass(model)
         along = (d * mass[:, None, None]).reshape(-1, self.modes)
         g = jnp.sum(along * d.reshape(along.shape), axis=0)
-        weight = HOLD * (g * model.fps**2 + model.vibrations.energy) / (g * g)
-        c = along.T @ moved.reshape(len(along), -1)
-        return jnp.sum(weight[:, None] * c * c, axis=0) / 2, (along @ (weight[:, None] * c)).reshape(moved.shape)
+        along = along / g[None]
+        r = along.T @ moved.reshape(len(along), -1)
+        inertia, force = (g * model.fps**2)[:, None] * r, model.vibrations.energy * swing.T
+        return jnp.sum(r * (inertia / 2 - force), axis=0), (along @ (inertia - force)).reshape(moved.shape)
 
     def _static_garment(self, params, model, z, matrices):
         """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
