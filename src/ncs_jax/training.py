@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.kinematics import Blend, blend, skin
 from ncs_jax.methods.shared import Method, decode, garment_blend, initial_parameters
-from ncs_jax.methods.swing import LARGEST, Swing
+from ncs_jax.methods.swing import Swing
 from ncs_jax.model import Model, pose_body, posed_bodies
 from ncs_jax.motion import Track
 from ncs_jax.numerics import norm
@@ -225,10 +225,11 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
         return jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
 
     def swung(network, params):
-        """Offsets with a swing, its own or that of another window, and what they are beyond the static ones."""
+        """Offsets with a swing, its own or any size of another frame's, and what they are beyond the static ones."""
         everyone = ends if axis is None else lax.all_gather(ends, axis, tiled=True)
-        share = LARGEST * number.astype(track.swing.dtype) / max(swapped - 1, 1)
-        at, share = jnp.where(number < swapped, everyone[pairs], ends), jnp.where(number < swapped, share, 1)
+        at = jnp.where(number < swapped, everyone[pairs], ends)
+        share = number.astype(track.swing.dtype) / max(swapped - 1, 1)
+        share = jnp.where(number < swapped, share * network.enlargement(track, at), 1)
         found = network.mixed(params, track, ends, at, share)
         z = found.together()
         offsets = decode(network, params, model, jnp.concatenate([z, lax.stop_gradient(found.static)]))

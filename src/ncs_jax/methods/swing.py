@@ -33,7 +33,7 @@ from ncs_jax.objective import Terms
 __all__ = ["Swing"]
 
 BLOCK = 32  # frames whose statics are posed together
-LARGEST = 1.5  # times another frame's swing is the most that motion augmentation puts on a pose; the least is none
+QUIET = 0.02  # of a track's largest swing: a smaller one is not enlarged that far
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,15 @@ class Swing:
         """Of frames with the swings of other frames, so much of them."""
         q = share[:, None] * track.swing[others]
         return Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
+
+    def enlargement(self, track: Track, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
+        """By how much the swings q of frames, enlarged, have the energy E_0 |q|^2 / 2 of the track's largest.
+
+        Most of a motion is quiet: so its poses are trained with swings as strong as any of the track's.
+        """
+        size = jnp.linalg.norm(track.swing, axis=1)
+        largest = jnp.max(size)
+        return largest / jnp.maximum(jnp.maximum(size[frames], QUIET * largest), jnp.finfo(size.dtype).tiny)
 
     def hold(
         self, model: Model, moved: Float[Array, "verts 3 batch"], swing: Float[Array, "batch modes"]
