@@ -1,6 +1,6 @@
 """The study: every experiment, and the page that has all their tables and pictures.
 
-    python -m experiments [--steps 1000] [--quick] [--out experiments] [--kept runs/study]
+    python -m experiments [--steps 700] [--quick] [--out experiments] [--kept runs/study]
 
 Writes OUT/README.md and its tables and pictures in OUT/results. What has been simulated and trained is kept in `--kept`, where
 a study that was interrupted goes on; a fresh one starts from an empty folder.
@@ -20,7 +20,7 @@ from experiments.study import KEPT, UNSEEN, keep_programs
 from ncs_jax import InputError, load_scene
 
 SCENE, SKIRT = "ncs:tshirt", "ncs:skirt"
-LONG = 4  # times as many steps for the methods side by side, and for motion control
+LONG = 5  # times as many steps for the methods side by side, and for motion control
 
 
 def section(title: str, module: Any, rows: Sequence[dict], out: Path, name: str, pictures: Sequence[str]) -> str:
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="experiments", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=1000, help="of training (default: 1000)")
+    parser.add_argument("--steps", type=int, default=700, help="of training (default: 700)")
     parser.add_argument("--quick", action="store_true", help="20 steps, to try it out: the numbers mean nothing")
     parser.add_argument("--out", default="experiments", help="folder for README.md and results/ (default: experiments)")
     parser.add_argument("--kept", type=Path, default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")

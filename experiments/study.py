@@ -212,6 +212,7 @@ def bars(path: Path, rows: Sequence[dict], key: str, columns: dict[str, str]) ->
             if name == "total":  # what sets energies apart is little of them
                 axes.set_xlim(min(values) - 0.5 * np.ptp(values), max(values) + 0.1 * np.ptp(values))
             axes.invert_yaxis()
+            axes.locator_params(axis="x", nbins=4)
             axes.set_xlabel(heading)
             if place:
                 axes.set_yticklabels([])
