@@ -45,6 +45,7 @@ from ncs_jax.motion import Track
 from ncs_jax.networks import DynamicEncoder
 
 TAPS = 11  # frames that the window sees
+STILL = 0.1  # of what the simulation moves after a stop
 BEFORE, AFTER = 100, 2000  # still frames
 MEASURED = COLUMNS | {
     "before": "still frames before: mm",
@@ -196,15 +197,15 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
 
 def conclusion(rows: Sequence[dict]) -> str:
     """What the numbers say."""
-    ours, *others = rows
-    best = min(rows, key=lambda row: row["distance"])
     kept = [row["network"] for row in rows if row["left_2000"] > 0.01]
-    told = "; ".join(f"{row['network']} {row['distance']:.1f} mm" for row in others)
-    never = f"never at rest again: {', '.join(kept)}" if kept else "all come to rest"
-    return (
-        f"Nearest to the simulation is {best['network']}, {best['distance']:.1f} mm (the default {ours['distance']:.1f} mm; "
-        f"{told}). Still frames before a motion change the default by {ours['before']:.2g} mm; after a stop, {never}."
-    )
+    far = "; ".join(f"{row['network']} {row['distance']:.1f} mm" for row in rows)
+    text = f"To the simulation: {far}."
+    if "stopped_share" in rows[0]:
+        moving = [f"{row['network']} {row['stopped_share']:.2f}" for row in rows if row["stopped_share"] >= STILL]
+        moving += [f"all others below {STILL}"] if len(moving) < len(rows) else []
+        text += f" After a stop, as a share of what the simulation moves: {', '.join(moving)}."
+    never = f"never at rest again: {', '.join(kept)}" if kept else "in the end all come to rest"
+    return f"{text} Still frames before a motion change the default by {rows[0]['before']:.2g} mm; {never}."
 
 
 main = partial(command, "architecture", __doc__, experiment)

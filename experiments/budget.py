@@ -65,18 +65,15 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
 def conclusion(rows: Sequence[dict]) -> str:
     """What the numbers say."""
     by = {row["change"]: row for row in rows}
-
-    def best(what):
-        some = [row for name, row in by.items() if what in name and "frames/s" not in name]
-        return min(some, key=lambda row: row["distance"])["change"]
+    far = ", ".join(f"{name} {row['distance']:.1f} mm" for name, row in by.items() if "frames/s" not in name)
 
     def rate(a, b):
         row = by[f"trained at {a:g} frames/s, used at {b:g}"]
         return f"{row['distance']:.1f} mm ({row['dynamic_share']:.2f} of the simulation's speed)"
 
     return (
-        f"Nearest to the simulation are a {best('window')}, a {best('batch')} and {best('motions')}; trained at 15 frames/s "
-        f"and used at 60 it is {rate(15, 60)} away, trained at 60 and used there {rate(60, 60)}."
+        f"To the simulation: {far}; trained at 15 frames/s and used at 60 {rate(15, 60)}, trained at 60 and used there "
+        f"{rate(60, 60)}."
     )
 
 
