@@ -428,7 +428,7 @@ def plans() -> dict[str, Plan]:
     out["stand"] = Plan(4.0, waves={"hips_side": [(0.3, 3.7, 1.2, 0.3)], "lean": [(0.3, 3.7, 1.5, 0.3)]})
     out["walk"] = Plan(6.5, walking(0.5, 12, 0.5), speed=[(0.35, 0), (1.35, 1.1)])
     out["walk_turn_stop"] = Plan(
-        8.0,
+        10.0,  # the last 4 s at rest, as a skirt swings for two
         walking(0.5, 10, 0.5),
         speed=[(0.35, 0), (1.25, 1.1), (1.75, 1.1), (2.45, 0.65), (3.65, 0.65), (4.35, 1.1), (4.9, 1.1), (5.3, 0)],
         heading=[(1.85, 0), (4.25, 180)],
