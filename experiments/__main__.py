@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import architecture, augmentation, budget, control, descriptors, falling, membranes, methods, spread
-from experiments.study import KEPT, UNSEEN, keep_programs
+from experiments.study import BALANCE, KEPT, STAND, UNSEEN, keep_programs, standing, stem
 from ncs_jax import InputError, load_scene
 
 SCENE, SKIRT = "ncs:tshirt", "ncs:skirt"
@@ -41,10 +41,11 @@ def study(steps: int, falls: int, out: Path, kept: Path) -> str:
         parts.append(section(title, module, rows, results, name, pictures))
         print(f"{(time.monotonic() - began) / 60:5.1f} min  {title}: {module.conclusion(rows)}", flush=True)
 
-    strips = [Path(motion.removeprefix("ncs:")).stem for motion in UNSEEN]
+    unseen = standing(scene, UNSEEN, kept)
+    strips = [*map(stem, unseen)]
     for name, one in (("methods", scene), ("skirt", skirt)):
         title = f"Four methods side by side: {one.garment.file.removeprefix('ncs:')}"
-        rows = methods.experiment(one, UNSEEN, LONG * steps, results, kept, name)
+        rows = methods.experiment(one, unseen, LONG * steps, results, kept, name)
         add(title, methods, rows, name, [f"{name}_{strip}" for strip in strips])
     add("Free fall and a pendulum", falling, falling.experiment(results, falls), "falling", ["falling"])
     for title, module, count in (
@@ -57,15 +58,16 @@ def study(steps: int, falls: int, out: Path, kept: Path) -> str:
         ("Membranes", membranes, steps),
     ):
         name = module.__name__.rpartition(".")[2]
-        add(title, module, module.experiment(scene, UNSEEN, count, results, kept), name, [name])
+        add(title, module, module.experiment(scene, unseen, count, results, kept), name, [name])
     minutes = (time.monotonic() - began) / 60
     head = f"""# The study
 
 Every claim of the method as an experiment on the packaged garments. All tables and pictures here are made by `make study`, in
 {minutes:.0f} minutes. Every network is trained from one seed on the scene's motions without
-{" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact: for
-{LONG * steps:,} steps where methods stand side by side and for motion control, for {steps:,} elsewhere. By how much such
-numbers differ from seed to seed says the section Spread.
+{" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact, of
+which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps where methods stand side by side and for motion
+control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
+seed to seed says the section Spread.
 """
     return "\n".join([head, *parts])
 

@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.speed_accuracy import streamed
-from experiments.study import COLUMNS, apart, changed, command, judged_on, recurrent, reference, trained, without, write
+from experiments.study import COLUMNS, apart, changed, command, judged_on, recurrent, reference, stem, trained, without, write
 from ncs_jax import Run, Scene, assemble
+from ncs_jax.dynamics import stops
 
 METHODS = ("pbns", "snug", "ncs")
 RECURRENT = "ncs, gated"  # beside NCS with the garment's own swing, if that is the scene's
@@ -52,13 +53,13 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     write(out, name, rows, {"method": "", **COLUMNS, "lag": "lag, s", "frame": "ms a frame"})
     run = Run(assemble(scene.without_network()), {})
     for k, motion in enumerate(unseen):
-        file = out / f"{name}_{Path(motion.removeprefix('ncs:')).stem}.png"
+        file = out / f"{name}_{stem(motion)}.png"
         draw(file, run, motion, {row["method"]: animations[k] for row, animations in made})
     return rows
 
 
 def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -> None:
-    """The contact sheets of all methods below each other."""
+    """The contact sheets of all methods below each other, of a motion up to a second after its last stop."""
     from PIL import Image, ImageDraw
 
     from ncs_jax.pictures import INK, PAPER, contact_sheet
@@ -66,11 +67,13 @@ def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -
 
     a = run.assembly
     body, faces = (None, None) if a.body is None else (posed_body(a.body, run.motion(motion)), a.body.faces)
+    end = max((first + round(a.model.fps) for first, _ in stops(run.track(motion), a.model.fps)), default=None)
+    body = None if body is None else body[:end]
     sheets = []
     with tempfile.TemporaryDirectory() as folder:
         for method, vertices in animations.items():
             file = Path(folder) / "sheet.png"
-            contact_sheet(file, vertices, a.garment.faces, body, faces, a.model.fps, tile=260)
+            contact_sheet(file, vertices[:end], a.garment.faces, body, faces, a.model.fps, tile=260)
             with Image.open(file) as drawn:
                 sheets.append((method, drawn.convert("RGB")))
     strip = Image.new("RGB", (max(s.width for _, s in sheets), sum(s.height for _, s in sheets)), PAPER)
@@ -92,7 +95,8 @@ def conclusion(rows: Sequence[dict]) -> str:
     text += f"{ncs['distance']:.1f} mm from it), SNUG {snug['dynamic_share']:.2f}, PBNS {pbns['dynamic_share']:.2f}"
     if "stopped_share" in ncs:
         text += f"; after a stop NCS still moves ({ncs['stopped_share']:.2f}), PBNS stands ({pbns['stopped_share']:.2f})"
-        text += f", and NCS settles in {ncs['settling']:.2f} s where the simulation takes {sim['settling']:.2f} s"
+        times = [f"{row['settling']:.2f} s" if "settling" in row else "longer than it was looked at" for row in (ncs, sim)]
+        text += f", and NCS settles in {times[0]} where the simulation takes {times[1]}"
     if RECURRENT in by:
         gated = by[RECURRENT]
         text += f". With a gated unit in place of the swing: {gated['dynamic_share']:.2f}"

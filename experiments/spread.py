@@ -25,7 +25,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     scene = without(scene, unseen)
     seeds = [scene.training.seed + k for k in range(SEEDS)]
     rows = networks({str(seed): changed(scene, training={"seed": seed}) for seed in seeds}, unseen, steps, kept, "seed")
-    of_all = {key: [row[key] for row in rows] for key in rows[0] if key != "seed"}
+    of_all = {key: [row[key] for row in rows] for key in rows[0] if key != "seed" and all(key in row for row in rows)}
     between = {"seed": RANGE} | {key: max(values) - min(values) for key, values in of_all.items()}
     write(out, "spread", [*rows, between], {"seed": "", **COLUMNS})
     bars(out / "spread.png", rows, "seed", {key: COLUMNS[key] for key in ("total", "dynamic_share", "distance")})
@@ -40,8 +40,10 @@ def conclusion(rows: Sequence[dict]) -> str:
         f"{between['dynamic_share']:.3f}, the hem correlation by {between['hem_correlation']:.3f} and the distance to the "
         f"simulation by {between['distance']:.2f} mm"
     )
+    if "stopped_share" in between:
+        text += f", what moves after a stop by {between['stopped_share']:.2f}"
     if "settling" in between:
-        text += f", what moves after a stop by {between['stopped_share']:.2f} and its settling by {between['settling']:.2f} s"
+        text += f", its settling by {between['settling']:.2f} s"
     return text + ": differences in this study that are smaller than these say nothing."
 
 

@@ -91,7 +91,7 @@ def studied(module, tmp_path, *more, text=SCENE):
     with (out / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert (out / f"{name}.md").read_text().count("\n") == 2 + len(rows)
-    told = module.conclusion([{k: number(v) for k, v in row.items()} for row in rows])
+    told = module.conclusion([{k: number(v) for k, v in row.items() if v} for row in rows])
     assert told.endswith(".") and "nan" not in told
     assert module.main([str(tmp_path / "nowhere.toml")]) == 2
     return {next(iter(row.values())): row for row in rows}

@@ -19,7 +19,7 @@ __all__ = ["MEASURES", "compare", "dynamics", "hem", "stops", "unposed"]
 MEASURES = {
     "speed": ("mm/s", "r.m.s. speed of the garment as seen from the body"),
     "lag": ("s", "how far the hem comes after the body that carries it"),
-    "settling": ("s", "after a stop, until the hem stays within a tenth of its way to rest; mean over the stops"),
+    "settling": ("s", "after a stop, until the hem's speed is down to a tenth; mean over the stops"),
     "overshoot": ("%", "after a stop, how far the hem goes beyond rest, of its way there; mean over the stops"),
     "gain": ("", "speed over that with alpha = 0"),
     "dynamic_share": ("", "speed over that of the reference"),
@@ -80,15 +80,22 @@ def _speed(u: np.ndarray, track: Track, fps: float, at=slice(None)) -> float:
     return 1000 * fps * float(np.sqrt(np.mean(np.sum(steps.astype(np.float64) ** 2, axis=-1)))) if len(steps) else 0.0
 
 
-def _after(path: np.ndarray, fps: float) -> tuple[float, float]:
-    """Of a path (frames, 3) that comes to rest at its end: settling time in s, and overshoot in %."""
+def _after(path: np.ndarray, fps: float) -> tuple[float | None, float]:
+    """Of a path (frames, 3) after a stop: settling time in s, None where it does not come to rest, and overshoot in %.
+
+    Settled is what has but a hundredth of sum_(s >= 0) |v_s|^2 to come: where a swing decays by exp(-t / T), that is after
+    T ln 10, which brings it to a tenth. Such a sum from the end has no steps where single swings leave a band or do not, and
+    does not ask where rest is. The last half second may hold a tenth of that hundredth. Source: Schroeder 1965, reverberation.
+    """
     away = path - path[-1]
-    size = np.linalg.norm(away, axis=1)
-    if size[0] == 0:
-        return 0.0, 0.0
-    beyond = -(away @ away[0]) / size[0] ** 2
-    outside = np.flatnonzero(size > SETTLED * size.max())
-    return float(outside[-1] + 1) / fps, 100 * float(max(beyond.max(), 0))
+    size = float(np.linalg.norm(away[0]))
+    overshoot = 100 * max(float((-(away @ away[0])).max()) / size**2, 0.0) if size > 0 else 0.0
+    left = np.cumsum(np.sum(np.diff(path, axis=0) ** 2, axis=1)[::-1])[::-1]
+    if left[0] == 0:
+        return 0.0, overshoot
+    if left[-round(STILL * fps)] > SETTLED**2 / 10 * left[0]:
+        return None, overshoot
+    return float(np.argmax(left <= SETTLED**2 * left[0])) / fps, overshoot
 
 
 def _lag(follows: np.ndarray, leads: np.ndarray, fps: float) -> float:
@@ -113,7 +120,8 @@ def _lag(follows: np.ndarray, leads: np.ndarray, fps: float) -> float:
 def dynamics(model: Model, vertices, track: Track) -> dict[str, float]:
     """How an animation (frames, verts, 3) of the model's garment moves by itself: the first four of `MEASURES`.
 
-    `settling` and `overshoot` are left out where the character never stops for half a second.
+    `settling` and `overshoot` are left out where the character never stops for half a second, and `settling` also where the
+    hem does not come to rest after any stop.
     """
     u, low, fps = unposed(model, vertices, track), hem(model), model.fps
     carried = np.asarray(_carried(model, track.matrices), np.float64)[:, low].mean(axis=1)
@@ -121,7 +129,10 @@ def dynamics(model: Model, vertices, track: Track) -> dict[str, float]:
     found = {"speed": _speed(u, track, fps), "lag": _lag(path, carried, fps)}
     after = [_after(u[first - 1 : last, low].astype(np.float64).mean(axis=1), fps) for first, last in stops(track, fps)]
     if after:
-        found["settling"], found["overshoot"] = (float(v) for v in np.mean(after, axis=0))
+        times = [time for time, _ in after if time is not None]
+        if times:
+            found["settling"] = float(np.mean(times))
+        found["overshoot"] = float(np.mean([overshoot for _, overshoot in after]))
     return found
 
 
