@@ -5,15 +5,19 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax import Scene, assemble
+from experiments.study import changed
+from ncs_jax import Assembly, Scene, assemble, scene_from
+from ncs_jax.assembly import track_of
 from ncs_jax.energies.collision import surface_from
 from ncs_jax.energies.proximity import groups_from
+from ncs_jax.io.npz import write_npz
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.model import pose_body
@@ -194,3 +198,82 @@ def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]
         garment = Garment(mesh, jnp.asarray(s.pins, jnp.int32), groups)
         found[name] = derivatives(terms, array(s.three[0]), array(s.along), garment, own, frame, on)
     return found
+
+
+# Scenes
+
+
+def hanging(folder: Path, size: float = 1.0, fps: float = 30.0, away: float = 0.0, jump: float = 0.0) -> Scene:
+    """A square sheet that hangs from a bar, which begins to move; lengths in m."""
+    n = 12
+    y, x = np.mgrid[:n, :n] / (n - 1) * size
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    a, b, c, d = corner, corner + 1, corner + n, corner + n + 1
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
+    place = np.stack([x, y, 0.1 * np.sin(7 * x / size) * size], axis=-1).reshape(-1, 3)
+    name = f"{size:g}_{fps:g}_{away:g}_{jump:g}"
+    write_npz(folder / f"sheet_{size:g}.npz", vertices=place, faces=faces, group_pins=np.arange(n * (n - 1), n * n))
+    way = np.zeros((8, 3))
+    way[:, 2] = size * 0.3 * (1 - np.cos(np.arange(8) / 30 * 6))
+    way[4:, 0] += jump * size
+    write_npz(folder / f"bar_{name}.npz", poses=np.zeros((8, 1, 3)), trans=way + away, fps=np.array(fps))
+    tables = {
+        "body": {"file": "none"},
+        "garment": {"file": f"sheet_{size:g}.npz", "pins": "pins"},
+        "motion": {"files": [f"bar_{name}.npz"], "fps": fps},
+        "network": {"static": [16, 32], "dynamic": [32], "decoder": [32], "modes": 16},
+        "training": {"window": 4, "batch": 8},
+    }
+    return scene_from(tables, source=str(folder / "scene.toml"))
+
+
+def least(folder: Path) -> list[tuple[str, Scene]]:
+    """The sheet that hangs from a bar, where something is as little as it can be."""
+    base = hanging(folder)
+    sheet, bar = (dict(np.load(folder / name)) for name in (base.garment.file, base.motion.files[0]))
+    n, x, faces = len(sheet["vertices"]), sheet["vertices"], sheet["faces"]
+
+    def garment(name: str, vertices: np.ndarray, faces: Any, pins: Sequence[int]) -> dict:
+        write_npz(folder / f"{name}.npz", vertices=vertices, faces=np.asarray(faces, np.int32), group_pins=np.asarray(pins))
+        return {"garment": {"file": f"{name}.npz"}}
+
+    write_npz(folder / "one_frame.npz", poses=bar["poses"][:1], trans=bar["trans"][:1], fps=bar["fps"])
+    pins = sheet["group_pins"]
+    triangle = np.array([[0, 1, 0], [0.3, 1, 0], [0.15, 0.7, 0.0]])
+    cases: dict[str, dict] = {
+        "a batch of 1": {"training": {"batch": 1}},
+        "a window of 1": {"training": {"window": 1}},
+        "no smooth modes": {"network": {"modes": 0}},
+        "one frame of motion": {"motion": {"files": ("one_frame.npz",)}},
+        "no motion": {"motion": {"files": ()}},
+        "one triangle": garment("triangle", triangle, [[0, 1, 2]], [0, 1]),
+        "two components": garment(
+            "two", np.concatenate([x, x + [0, 0, 1]]), np.concatenate([faces, faces + n]), [*pins, *(pins + n)]
+        ),
+        "vertices without faces": garment("loose", np.concatenate([x, [[0, 0, 1.0]]]), faces, pins),
+        "a face given twice": garment("twice", x, np.concatenate([faces, faces[:1]]), pins),
+        "no garment vertices": garment("none", x[:0], faces[:0], pins[:0]),
+    }
+    return [(name, changed(base, **tables)) for name, tables in cases.items()]
+
+
+def limbs(scene: Scene) -> list[tuple[str, Assembly]]:
+    """The scene's garment on its body, whose limbs are somewhere else from one frame to the next."""
+    a = assemble(changed(scene, physics={"collision": {"distance": "smooth"}}).without_network())
+    like = a.motions[scene.motion.files[0]]
+    joints, names = like.poses.shape[1], list(like.joint_names)
+    at_once = np.arange(8) >= 4
+
+    def moved(turned: dict[str, Sequence[float]], way: Sequence[float] = (0, 0, 0)) -> Assembly:
+        poses = np.zeros((8, joints, 3), np.float32)
+        for name, degrees in turned.items():
+            poses[at_once, names.index(name)] = np.radians(degrees)
+        record = replace(like, poses=poses, translation=at_once[:, None] * np.asarray(way, float))
+        return replace(a, track=track_of(a.model, record))
+
+    return [
+        ("arms through the torso", moved({"LeftArm": (0, -170, 0), "RightArm": (0, 170, 0)})),
+        ("an arm turned by 180 degrees", moved({"LeftArm": (0, 0, 180)})),
+        ("every joint turned by 180 degrees", moved(dict.fromkeys(names, (180, 0, 0)))),
+        ("10 m aside", moved({}, (10, 0, 0))),
+    ]

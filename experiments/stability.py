@@ -1,12 +1,13 @@
 """Where does it break? Energies, networks, simulator and training, each swept along one axis after another until they do.
 
-    python -m experiments.stability [--out experiments/results] [--only energies networks simulator training runs]
+    python -m experiments.stability [--out experiments/results] [--only energies networks simulator training scenes runs]
 
 All is worked out in float32 and in float64 from the same numbers. A cell of the map is how far the two are apart, as a share
 of the result: of an energy the worst of its value, its gradient and its second derivative along a direction; of networks and
 simulator the vertices. It is `safe` up to a thousandth (of the simulator a hundredth, which its tolerance leaves), `at risk`
-above it, `broken` where a number is not finite. Training has nothing to be compared with: it is safe where no step is dropped
-and the energy falls. Writes stability_PART.csv, .md and .png of every part. Twenty minutes on two cores.
+above it, `broken` where a number is not finite, `refused` where a scene is not accepted. Training has nothing to be compared
+with: it is safe where no step is dropped and the energy falls. Limbs that leap have no one answer: the simulator is safe
+where it finds its balance. Writes stability_PART.csv, .md and .png of every part. Half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -24,12 +25,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.specimens import TERMS, along_axis, evaluated, shapes, specimen
+from experiments.specimens import TERMS, along_axis, evaluated, hanging, least, limbs, shapes, specimen
 from experiments.study import axes_of, changed, write
-from ncs_jax import InputError, Scene, assemble, load_scene, scene_from, train
+from ncs_jax import InputError, Scene, assemble, load_scene, train
 from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
-from ncs_jax.io.npz import write_npz
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
 from ncs_jax.objective import Material
@@ -40,7 +40,7 @@ from ncs_jax.training import TrainState, batches, chunk_runner, initial_state, w
 
 TOLERANCES = {"simulator": 1e-2}  # what its solver leaves, 0.1 g
 TOLERANCE = 1e-3  # of all else
-STATES = ("safe", "at risk", "broken")
+STATES = ("safe", "at risk", "broken", "refused")
 
 
 def tens(low: int, high: int) -> tuple[float, ...]:
@@ -69,7 +69,9 @@ def apart(single: Any, double: Any) -> float:
 
 
 def state(subject: str, error: float) -> str:
-    """What a cell of the map says."""
+    """What a cell of the map says; an error that is no number says that the scene was refused."""
+    if np.isnan(error):
+        return "refused"
     return STATES[2 if not np.isfinite(error) else int(error > TOLERANCES.get(subject, TOLERANCE))]
 
 
@@ -185,6 +187,10 @@ def of_networks(scene: Scene, quick: bool) -> list[dict]:
         for value in (10.0**k for k in range(1, 5) if 10**k <= long):
             part = slice(int(0.9 * value), int(value))
             rows.append(cell("network", axis, value, apart(single[part], double[part])))
+    small = run.compressed(scene.motion.files[0], bfloat16=True)
+    for _, alpha, case, _ in (c for c in cases if c[0] == "alpha"):
+        found = Wearer(small.assembly, wearer.double, small.params).vertices(case, alpha)[0]
+        rows.append(cell("network, bfloat16", "alpha", alpha, apart(found, wearer.vertices(case, alpha)[1])))
     for fps in [30] if quick else [1, 5, 15, 30, 60, 120, 240, 1000]:
         once, twice = (replace(b, model=replace(b.model, fps=float(fps))) for b in (a, wearer.double))
         used = replace(record, fps=float(fps))
@@ -193,30 +199,6 @@ def of_networks(scene: Scene, quick: bool) -> list[dict]:
 
 
 # Simulator and training
-
-
-def hanging(folder: Path, size: float = 1.0, fps: float = 30.0, away: float = 0.0, jump: float = 0.0) -> Scene:
-    """A square sheet that hangs from a bar, which begins to move; lengths in m."""
-    n = 12
-    y, x = np.mgrid[:n, :n] / (n - 1) * size
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
-    a, b, c, d = corner, corner + 1, corner + n, corner + n + 1
-    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
-    place = np.stack([x, y, 0.1 * np.sin(7 * x / size) * size], axis=-1).reshape(-1, 3)
-    name = f"{size:g}_{fps:g}_{away:g}_{jump:g}"
-    write_npz(folder / f"sheet_{size:g}.npz", vertices=place, faces=faces, group_pins=np.arange(n * (n - 1), n * n))
-    way = np.zeros((8, 3))
-    way[:, 2] = size * 0.3 * (1 - np.cos(np.arange(8) / 30 * 6))
-    way[4:, 0] += jump * size
-    write_npz(folder / f"bar_{name}.npz", poses=np.zeros((8, 1, 3)), trans=way + away, fps=np.array(fps))
-    tables = {
-        "body": {"file": "none"},
-        "garment": {"file": f"sheet_{size:g}.npz", "pins": "pins"},
-        "motion": {"files": [f"bar_{name}.npz"], "fps": fps},
-        "network": {"static": [16, 32], "dynamic": [32], "decoder": [32], "modes": 16},
-        "training": {"window": 4, "batch": 8},
-    }
-    return scene_from(tables, source=str(folder / "scene.toml"))
 
 
 def materials(material: Material, axis: str, value: float) -> Material:
@@ -249,43 +231,68 @@ def simulated(simulator, track: Track, settings: Settings):
 SWEPT = {**PHYSICS, "jump within a frame, sizes": tens(-1, 4)}
 
 
+def simulated_apart(axis: str, value: Any, made: Callable[[Any], Any]) -> dict:
+    """The row of a simulation of what is made ready in either precision."""
+    found = []
+    for dtype in (jnp.float32, jnp.float64):
+        a = made(dtype)
+        x, solution = simulated(simulator_from(a.model), a.track, Settings())
+        found.append((a.track.relative(x) - np.asarray(a.track.matrices)[:, :1, :, 3], solution))
+    (single, solution), (double, exact) = found
+    return cell(
+        "simulator", axis, value, apart(single, double), residual=float(np.max(solution.residual)),
+        iterations=int(np.max(solution.iterations)), status=int(np.max(solution.status)), status64=int(np.max(exact.status)),
+    )  # fmt: skip
+
+
+def learned(axis: str, value: Any, a: Any, seed: int = 0, steps: int = 60) -> dict:
+    """The row of a training: by how much its last energies are above its first, as a share, where they are; see `fall`."""
+    spec, network = a.scene.training, cast(Any, a.network)
+    track = with_bodies(a.model, a.track, spec.batch)
+    ends = batches(len(track.start), spec.batch, seed, 0, steps)
+    end, logs = runner(network, spec)(initial_state(a.model, network, seed), ends, np.zeros_like(ends), steps, a.model, track)
+    return fall("training", axis, value, end, logs)
+
+
 def of_simulator(scene: Scene, quick: bool) -> list[dict]:
-    """A sheet that hangs from a bar, along every axis."""
+    """A sheet that hangs from a bar, along every axis; and the scene's garment when limbs go where none can."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for axis, values in SWEPT.items():
+            for value in values[:: 9 if quick else 1]:
+                rows.append(simulated_apart(axis, value, functools.partial(hung, Path(folder), axis, value)))
+    for name, a in limbs(scene)[: 1 if quick else None]:
+        x, solution = simulated(simulator_from(a.model), a.track, Settings())
+        left = float(np.max(solution.residual))
+        error = (left if np.any(solution.status) else 0.0) if np.all(np.isfinite(x)) else np.inf
+        status = int(np.max(solution.status))
+        rows.append(cell("simulator", "limbs, on a body", name, error, residual=left, status=status))
+    return rows
+
+
+def of_training(scene: Scene, quick: bool) -> list[dict]:
+    """The same sheet learned for 60 steps, along every axis."""
     del scene
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for axis, values in SWEPT.items():
             for value in values[:: 9 if quick else 1]:
-                found = []
-                for dtype in (jnp.float32, jnp.float64):
-                    a = hung(Path(folder), axis, value, dtype)
-                    x, solution = simulated(simulator_from(a.model), a.track, Settings())
-                    found.append((a.track.relative(x) - np.asarray(a.track.matrices)[:, :1, :, 3], solution))
-                (single, solution), (double, exact) = found
-                error = apart(single, double)
-                rows.append(
-                    cell(
-                        "simulator", axis, value, error, residual=float(np.max(solution.residual)),
-                        iterations=int(np.max(solution.iterations)), status=int(np.max(solution.status)),
-                        status64=int(np.max(exact.status)),
-                    )
-                )  # fmt: skip
+                rows.append(learned(axis, value, hung(Path(folder), axis, value, jnp.float32)))
     return rows
 
 
-def of_training(scene: Scene, quick: bool) -> list[dict]:
-    """The same sheet learned for 60 steps. The error is the last energy over the first, less one, where that is above zero."""
+def of_scenes(scene: Scene, quick: bool) -> list[dict]:
+    """Scenes of which something is as little as it can be, learned and simulated."""
     del scene
-    rows, steps = [], 60
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for axis, values in SWEPT.items():
-            for value in values[:: 9 if quick else 1]:
-                a = hung(Path(folder), axis, value, jnp.float32)
-                spec, network = a.scene.training, cast(Any, a.network)
-                ends = batches(len(a.track.start), spec.batch, 0, 0, steps)
-                begun = initial_state(a.model, a.network, 0)
-                end, logs = runner(network, spec)(begun, ends, np.zeros_like(ends), steps, a.model, a.track)
-                rows.append(fall("training", axis, value, end, logs))
+        for name, small in least(Path(folder))[: 2 if quick else None]:
+            made = functools.partial(assemble, small)
+            try:
+                rows.append(learned("scene", name, made()))
+                rows.append(simulated_apart("scene", name, lambda dtype, made=made: made(dtype=dtype)))
+            except InputError as error:
+                rows.append(cell("training", "scene", name, np.nan, why=str(error)))
     return rows
 
 
@@ -308,18 +315,12 @@ EDGES: dict[str, tuple[str, dict]] = {
 
 
 def of_runs(scene: Scene, quick: bool) -> list[dict]:
-    """Five seeds each of four scenes at the edges, 500 steps. The error is as in `of_training`."""
+    """Five seeds each of four scenes at the edges, 500 steps."""
     del scene
-    rows, steps = [], 20 if quick else 500
+    rows = []
     for name, (base, tables) in EDGES.items():
         a = assemble(changed(load_scene(base), **tables))
-        spec, network = a.scene.training, cast(Any, a.network)
-        track = with_bodies(a.model, a.track, spec.batch)
-        for seed in range(1 if quick else 5):
-            ends = batches(len(track.start), spec.batch, seed, 0, steps)
-            begun = initial_state(a.model, a.network, seed)
-            end, logs = runner(network, spec)(begun, ends, np.zeros_like(ends), steps, a.model, track)
-            rows.append(fall("training", name, seed, end, logs))
+        rows += [learned(name, seed, a, seed, 20 if quick else 500) for seed in range(1 if quick else 5)]
     return rows
 
 
@@ -346,6 +347,7 @@ PARTS: dict[str, Callable[[Scene, bool], list[dict]]] = {
     "networks": of_networks,
     "simulator": of_simulator,
     "training": of_training,
+    "scenes": of_scenes,
     "runs": of_runs,
 }
 

@@ -16,11 +16,13 @@ from experiments import (
     membranes,
     methods,
     seeds,
+    specimens,
     speed_accuracy,
     spread,
     stability,
     study,
 )
+from ncs_jax import InputError, assemble
 
 from .scenes import SCENE, swing, write_scene
 
@@ -182,6 +184,20 @@ def test_falling(tmp_path, capsys):
         rows = {(row["case"], row["inertia"]): row for row in csv.DictReader(file)}
     assert len(rows) == 6 and (tmp_path / "falling.png").read_bytes()[:4] == b"\x89PNG"
     assert float(rows["free fall", "simulation"]["mean"]) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["a batch of 1", "a window of 1", "one triangle"])
+def test_scenes_of_the_least_size_train(tmp_path, name):
+    scene = dict(specimens.least(tmp_path))[name]
+    row = stability.learned("scene", name, assemble(scene), steps=4)
+    assert row["dropped"] == 0 and np.isfinite(row["last"]) and row["first"] != row["last"]
+
+
+def test_scenes_that_are_none_are_refused(tmp_path):
+    scenes = dict(specimens.least(tmp_path))
+    for name in ("vertices without faces", "a face given twice", "no garment vertices"):
+        with pytest.raises(InputError, match=r"\.npz"):
+            assemble(scenes[name])
 
 
 @pytest.mark.slow  # nearly all of it is compiling, in two precisions

@@ -257,7 +257,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
     moves = bool(prepared.moves)
     terms = Terms(
         membrane=membrane if any(numbers) else None,
-        bending=physics.bending.stiffness > 0,
+        bending=physics.bending.stiffness > 0 and len(mesh.hinges) > 0,
         collision=physics.collision.distance if collides else None,
         exact=physics.collision.search == "exact",
         friction=collides and physics.inertia and moves and physics.collision.friction > 0,

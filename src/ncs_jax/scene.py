@@ -160,7 +160,7 @@ class TrainingSpec:
 
     steps: int = _f(5000, "optimiser steps", low=1, high=10_000_000)
     batch: int = _f(32, "windows a step", low=1, high=65536)
-    window: int = _f(11, "frames a window", low=1, high=10000)
+    window: int = _f(11, "frames a window; inertia sees at least 3", low=1, high=10000)
     learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
     motion_augmentation: float = _f(0.0, "share of a batch with another window's motion", low=0, high=1)
     validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)

@@ -212,7 +212,7 @@ def gradients(model: Model, network: Method, spec: TrainingSpec, params, track: 
     own = number >= augmented
 
     def codes(params):
-        z_static, z_dynamic, _ = network.windows(params, track, ends, spec.window, history)
+        z_static, z_dynamic, _ = network.windows(params, track, ends, max(spec.window, history), history)
         if z_dynamic is None:
             return z_static
         if not augmented:
