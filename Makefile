@@ -5,7 +5,7 @@ CONSTRAINTS = constraints/python$(shell $(PYTHON) -c 'import sys; print("%d.%d" 
 INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
 	$(if $(wildcard $(CONSTRAINTS)),--constraint $(CONSTRAINTS))
 
-.PHONY: demo test test-all thorough bench study stability lint format assets clean
+.PHONY: demo test test-all thorough bench study stability docs lint format assets clean
 
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
@@ -37,6 +37,10 @@ study: .venv/installed
 # Where energies, networks, simulator and training break: tables and pictures in experiments/results. About half an hour.
 stability: .venv/installed
 	$(BIN)/python -m experiments.stability
+
+# The documentation, into build/site. Warnings are errors.
+docs: .venv/ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 lint: .venv/ready
 	$(BIN)/ruff check .
