@@ -127,7 +127,7 @@ def out_of_range(folder, scene):
 def garment_in_centimetres(folder, scene):
     vertices, faces = grid()
     np.savez(folder / "cloth.npz", vertices=100 * vertices, faces=faces)
-    return ["cloth.npz", "vertices", "metres", "divide by 100"]
+    return ["cloth.npz", "vertices", "centimetres", "scale = 0.01"]
 
 
 def garment_elsewhere(folder, scene):
@@ -283,13 +283,15 @@ def test_train_says_where_it_is(run_folder, tmp_path, capsys):
     assert main(["train", str(scene), "--out", str(tmp_path / "run")]) == 2
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "frames"])
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])
 def test_animate_in_every_format(run_folder, tmp_path, capsys, name):
     _, folder = run_folder
     assert main(["animate", str(folder), "--out", str(tmp_path / name), "--alpha", "1.5"]) == 0
     assert "24 frames" in capsys.readouterr().out
     assert (tmp_path / name).exists()
-    if name != "frames":
+    if name == "a.glb":
+        assert (tmp_path / name).read_bytes()[:4] == b"glTF"
+    elif name != "frames":
         assert io.read_animation(tmp_path / name).vertices.shape == (24, 30, 3)
     else:
         assert len(list((tmp_path / name).glob("*.obj"))) == 24

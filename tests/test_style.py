@@ -19,7 +19,7 @@ MODULES = {
 }
 MODULES["ncs_jax"] = MODULES.pop("__init__")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
-HEAVY = {"trimesh", "h5py", "matplotlib", "PIL", "rich", "orbax", "tensorboardX"}
+HEAVY = {"trimesh", "h5py", "matplotlib", "PIL", "rich", "orbax", "pxr", "tensorboardX"}
 PICTURES = {"pictures", "rasteriser", "preview", "viewer"}  # these exist to draw
 OUTSIDE = {"io", "scene", "assembly", "checkpoint", "runs", "simulation", "cli"} | PICTURES  # read files, print or draw
 

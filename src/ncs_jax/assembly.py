@@ -12,6 +12,7 @@ from ncs_jax import io
 from ncs_jax.energies.collision import Surface, surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
+from ncs_jax.fit import check_worn
 from ncs_jax.kinematics import Skeleton, blend, blend_from, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
@@ -125,25 +126,13 @@ def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
 
 
 def _check_fit(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
-    file = scene.path(scene.garment.file)
-    size, tall = np.ptp(garment.vertices, axis=0).max(), np.ptp(body.vertices, axis=0).max()
+    tall = np.ptp(body.vertices, axis=0).max()
     if not 0.3 < tall < 5:
         raise InputError(
             "a body in metres expected, 0.3 to 5 m tall", file=scene.path(scene.body.file), field="vertices",
             value=f"{tall:.3g} m", mend="scale it to metres",
         )  # fmt: skip
-    if size > 3 * tall or size < tall / 30:
-        raise InputError(
-            f"a garment about the size of the body ({tall:.2f} m) expected", file=file, field="vertices",
-            value=f"{size:.3g} m", mend="scale it to metres (centimetres: divide by 100)",
-        )  # fmt: skip
-    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
-    gap = np.maximum(garment.vertices.min(axis=0) - high, low - garment.vertices.max(axis=0))
-    if gap.max() > 0.1 * tall:
-        raise InputError(
-            "a garment that is on the body expected", file=file, field="vertices", value=f"{gap.max():.2f} m apart",
-            mend="move it into the body's coordinates, or turn its axes to Y up",
-        )  # fmt: skip
+    check_worn(scene.path(scene.garment.file), garment, body.vertices, told=bool(scene.garment.up))
 
 
 def _inputs(scene: Scene, body: io.BodyRecord, wanted: tuple[int, ...]) -> tuple[int, ...]:
@@ -174,7 +163,8 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
     body = None if scene.body.file in ("", "none") else io.read_body(scene.path(scene.body.file))
-    garment = io.read_garment(scene.path(scene.garment.file))
+    worn = scene.garment
+    garment = io.read_garment(scene.path(worn.file), scale=worn.scale, up=worn.up, weld=worn.weld)
     if body is not None:
         _check_fit(scene, garment, body)
     pins = _pins(scene, garment)

@@ -25,6 +25,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
 """
+FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -85,14 +86,14 @@ def _parser() -> argparse.ArgumentParser:
         "--rank", type=_whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
     )
     animate.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
-    animate.add_argument("--out", required=True, metavar="FILE", help=".npz, .h5, .pc2, or a folder of .obj")
+    animate.add_argument("--out", required=True, metavar="FILE", help=FORMATS)
 
     simulate = command("simulate", _simulate, "animate the garment of a scene by full-space simulation, without a network")
     simulate.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
     simulate.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
     simulate.add_argument(
         "--out", required=True, metavar="FILE",
-        help=".npz, .h5, .pc2, or a folder of .obj; an interrupted simulation goes on from FILE.partial.npz",
+        help=f"{FORMATS}; an interrupted simulation goes on from FILE.partial.npz",
     )  # fmt: skip
 
     evaluate = command("evaluate", _evaluate, "measure strain, shear, penetration, energies and forces out of balance")
@@ -306,7 +307,8 @@ def _animate(options) -> int:
         whole, vertices = vertices, smaller.animate(motions[0], options.alpha)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
-    io.write_animation(options.out, vertices, run.assembly.garment.faces, run.assembly.model.fps)
+    garment = run.assembly.garment
+    io.write_animation(options.out, vertices, garment.faces, run.assembly.model.fps, rest=garment.vertices)
     print(
         f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices{error}"
     )
@@ -334,7 +336,8 @@ def _simulate(options) -> int:
                 print(text, flush=True)
 
         result = simulate(options.scene, options.motion, partial=partial, report=show)
-    io.write_animation(options.out, result.vertices, result.assembly.garment.faces, result.fps)
+    garment = result.assembly.garment
+    io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
     print(
@@ -426,6 +429,7 @@ def _evaluate(options) -> int:
 def _check(options) -> int:
     from ncs_jax.assembly import assemble
     from ncs_jax.grading import findings
+    from ncs_jax.io.surface import anatomy
     from ncs_jax.scene import template
 
     if options.fields:
@@ -443,6 +447,12 @@ def _check(options) -> int:
     mass = float((mesh.vertex_area * model.material.density).sum())
     size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
     print(f"  garment   {mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
+    record = assembly.garment
+    parts = anatomy(record.vertices, record.faces)
+    print(f"  surface   connected components {parts.components}, boundary loops (holes) {parts.loops}, ", end="")
+    print(f"degenerate triangles {parts.degenerate}")
+    kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
+    print(f"  file      {record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if model.body is not None:
         print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     print(f"  joints    {', '.join(joints)}")

@@ -93,7 +93,7 @@ def _mesh(a: Assembly) -> Iterator[Finding]:
     yield from _outside("height of a triangle", worst, shown, "its strain is rounding", clean)
     twice = len(x) - len(np.unique(x, axis=0))
     if twice:
-        yield Finding("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "weld them")
+        yield Finding("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
 
 
 @jax.jit

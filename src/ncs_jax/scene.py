@@ -63,6 +63,9 @@ class GarmentSpec:
     """[garment]: what it wears."""
 
     file: str = _f("ncs:tshirt", "garment mesh in its rest shape on the resting body")
+    scale: float = _f(0.0, "metres a unit of the file, 0.01 for cm; 0: as the file says, else 1", low=0, high=1e6)
+    up: str = _f("", "axis that is up in the file; empty: as the file says, else y", choices=("", "x", "y", "z"))
+    weld: float = _f(0.0, "vertices within it of each other become one, m; 0: none", low=0, high=1)
     smoothing: int = _f(10, "how many times the skinning weights are averaged over the garment", low=0, high=10000)
     pins: str = _f("", "name of the vertex group that is pinned; empty: none")
     learn_weights: bool = _f(False, "train the skinning weights too")

@@ -1,4 +1,4 @@
-"""Animations to and from .npz, .h5 and .pc2, and to a folder of .obj files."""
+"""Animations to and from .npz, .h5, .pc2, .mdd and USD, and to .glb and a folder of .obj files."""
 
 from __future__ import annotations
 
@@ -10,27 +10,36 @@ from numpy.typing import ArrayLike
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.files import replacing
+from ncs_jax.io.glb import write_glb
 from ncs_jax.io.hdf5 import read_hdf5, write_hdf5
+from ncs_jax.io.mdd import read_mdd, write_mdd
 from ncs_jax.io.npz import read_npz, write_npz
 from ncs_jax.io.obj import format_obj
 from ncs_jax.io.pc2 import read_pc2, write_pc2
 from ncs_jax.io.records import AnimationRecord
 from ncs_jax.io.table import floats, indices
+from ncs_jax.io.usd import USD, read_usd_animation, write_usd
 
 __all__ = ["read_animation", "write_animation"]
 
 FIELDS = ("vertices", "faces", "fps")
-FORMATS = (".npz", ".h5", ".hdf5", ".pc2")
+READABLE = (".npz", ".h5", ".hdf5", ".pc2", ".mdd", *USD)
+FORMATS = (*READABLE, ".glb")
 
 
-def write_animation(path: str | Path, vertices: ArrayLike, faces: ArrayLike, fps: float | int) -> None:
+def write_animation(
+    path: str | Path, vertices: ArrayLike, faces: ArrayLike, fps: float | int, *, rest: ArrayLike | None = None
+) -> None:
     """Write a moving mesh; the suffix says how, and the file or folder appears whole or not at all.
 
-    .npz and .h5 hold `vertices` (T, V, 3) float32, `faces` (F, 3) int32 and `fps`. .pc2 holds the vertices only. A path without
-    a suffix, or one that ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces such a folder and no other.
+    .npz and .h5 hold `vertices` (T, V, 3) float32, `faces` (F, 3) int32 and `fps`. .pc2 and .mdd hold the vertices only, in the
+    order in which they are given, which is the garment file's: they go onto the mesh of that file. .glb plays in viewers, see
+    `write_glb`; .usd, .usdc, .usda and .usdz hold the rest shape too, see `write_usd`. A path without a suffix, or one that
+    ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces such a folder and no other.
 
     Args:
         path: where to. Missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
+        rest: (V, 3) m, the shape at rest, for USD; else that of the first frame.
 
     Raises:
         InputError: the suffix is unknown, the arrays do not fit together or are not finite, or the place cannot be written to.
@@ -51,6 +60,13 @@ def write_animation(path: str | Path, vertices: ArrayLike, faces: ArrayLike, fps
         write_npz(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     elif suffix == ".pc2":
         write_pc2(file, x)
+    elif suffix == ".mdd":
+        write_mdd(file, x, float(fps))
+    elif suffix == ".glb":
+        write_glb(file, x, triangles, float(fps))
+    elif suffix in USD:
+        given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
+        write_usd(file, x, triangles, float(fps), given)
     elif suffix:
         write_hdf5(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     else:
@@ -78,24 +94,30 @@ def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: floa
 
 
 def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: float | int | None = None) -> AnimationRecord:
-    """A moving mesh from .npz, .h5 or .pc2.
+    """A moving mesh from .npz, .h5, .pc2, .mdd or USD.
 
     Args:
-        path: the file. faces, fps: of a .pc2, which holds neither; without them there are no faces and fps is NaN.
+        path: the file. faces, fps: of a .pc2, which holds neither, and faces of an .mdd; without them there are no faces and
+            fps is NaN.
 
     Raises:
         InputError: the file cannot be read, its arrays do not fit together, or a number is not finite.
     """
     suffix = Path(path).suffix.lower()
+    triangles = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
+    rate = np.nan if fps is None else float(fps)
     if suffix == ".pc2":
         file, x = read_pc2(path)
-        triangles = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
-        rate = np.nan if fps is None else float(fps)
-    elif suffix in FORMATS:
+    elif suffix == ".mdd":
+        file, x, rate = read_mdd(path)
+    elif suffix in USD:
+        file, x, triangles, rate = read_usd_animation(path)
+    elif suffix in READABLE:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
         file, x, triangles, rate = table.file, table.array("vertices"), table.array("faces"), table.number("fps")
     else:
-        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
+        mend = "write it as one of these too" if suffix in FORMATS else "convert it"
+        raise InputError(f"one of {', '.join(READABLE)} expected", file=path, value=suffix or "no suffix", mend=mend)
     x = floats(file, "vertices", x, ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
     if 0 in x.shape:
         raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)

@@ -81,7 +81,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     file = Path(path).expanduser()
     if "\0" in str(file) or not file.name:
         raise InputError("a file name expected", file=file, value=str(path), mend="name a file")
-    part = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    part = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}.part{file.suffix}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         yield part

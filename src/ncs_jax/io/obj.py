@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.files import text_of
+from ncs_jax.io.polygons import triangulate
 
 __all__ = ["format_obj", "read_obj"]
 
@@ -16,14 +16,14 @@ __all__ = ["format_obj", "read_obj"]
 def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
     """The file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2).
 
-    Polygons are cut into a fan from their first corner, negative numbers count back from the last vertex, and objects, groups,
+    Polygons are cut as `triangulate` says, negative numbers count back from the last vertex, and objects, groups,
     materials, normals, lines and points are passed over. Texture coordinates are None where a vertex has none, or two that
     differ.
     """
     file, text = text_of(path)
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
+    counts: list[int] = []
     corners: list[tuple[int, int]] = []  # (vertex, texture coordinate)
     for line, words in _lines(text):
         if words[0] == "v":
@@ -34,10 +34,11 @@ def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray
             polygon = [_corner(file, line, word, len(vertices), len(coordinates)) for word in words[1:]]
             if len(polygon) < 3:
                 raise InputError("three corners or more expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
-            faces.extend((polygon[0][0], a[0], b[0]) for a, b in pairwise(polygon[1:]))
+            counts.append(len(polygon))
             corners.extend(polygon)
     x = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    return file, x, np.array(faces, dtype=np.int32).reshape(-1, 3), _per_vertex(len(x), coordinates, corners)
+    cut = triangulate(file, x, np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2)[:, 0])
+    return file, x, cut, _per_vertex(len(x), coordinates, corners)
 
 
 def _lines(text: str):

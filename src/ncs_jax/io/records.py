@@ -35,13 +35,17 @@ class GarmentRecord:
 
     Attributes:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
-            or a vertex has several. groups: named vertex sets, each sorted int32.
+            or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: metres a unit of the file and the
+            axis that is up in it, which were applied. welded: how many of the file's vertices became one with another.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None = None
     groups: dict[str, np.ndarray] = field(default_factory=dict)
+    scale: float = 1.0
+    up: str = "y"
+    welded: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,56 @@
-"""What makes triangles a cloth: an oriented manifold mesh without loose vertices."""
+"""What makes triangles a cloth: an oriented manifold mesh without loose vertices; and what it is made of."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["check_surface"]
+__all__ = ["Anatomy", "anatomy", "check_surface"]
+
+FLAT = 1e-6  # height of a triangle, of its longest edge, below which it is degenerate: float32 cannot tell it from a line
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Connected components of a surface, loops of its boundary (its holes), and triangles so slim that they have no normal."""
+
+    components: int
+    loops: int
+    degenerate: int
+
+
+def anatomy(x: np.ndarray, faces: np.ndarray) -> Anatomy:
+    """Of vertices (V, 3) and triangles (F, 3) that `check_surface` has passed."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    graph = coo_array((np.ones(len(half), bool), tuple(half.T)), shape=(len(x), len(x)))
+    a, b, c = (x[faces[:, k]].astype(np.float64) for k in range(3))
+    longest = np.max([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return Anatomy(int(connected_components(graph, directed=False)[0]), _loops(half), int((double <= FLAT * longest).sum()))
+
+
+def _loops(half: np.ndarray) -> int:
+    """How many loops the edges (2 vertices) of one face alone form, where the next one is found around a vertex."""
+    edges = [tuple(e) for e in half.tolist()]
+    after = {e: edges[i + 1 - 3 * (i % 3 == 2)] for i, e in enumerate(edges)}  # the next edge in its triangle
+    border = {e for e in edges if e[::-1] not in after}
+    loops = 0
+    while border:
+        loops += 1
+        edge = next(iter(border))
+        while edge in border:
+            border.remove(edge)
+            edge = after[edge]
+            while edge[::-1] in after:
+                edge = after[edge[::-1]]
+    return loops
 
 
 def check_surface(file: Path, faces: np.ndarray, count: int) -> None:

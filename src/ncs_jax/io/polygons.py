@@ -1,0 +1,116 @@
+"""Polygons cut into triangles that do not fold: fans where they are convex, ears where they are not."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+
+__all__ = ["triangulate"]
+
+
+def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarray, skip: Collection[int] = ()) -> np.ndarray:
+    """Triangles (F, 3) int32 of polygons, in their order and each facing as its polygon does.
+
+    A polygon is cut by a fan from its first corner where every triangle of it faces as the polygon's normal (Newell's); else
+    by one from its second corner; else ear by ear, as seen along the normal. One of no area becomes the fan that it is.
+
+    Args:
+        file: what an error names. x: (V, 3) vertices. counts: (P,) corners of each polygon. corners: (sum of counts,) vertices
+            from 0 to V - 1, polygon after polygon. skip: polygons to leave out.
+
+    Raises:
+        InputError: a polygon has fewer than three corners, counts and corners do not fit, or a polygon crosses itself.
+    """
+    counts = np.asarray(counts).reshape(-1)
+    if counts.dtype.kind not in "iu" or (counts < 3).any() or counts.sum(dtype=np.float64) != len(corners):
+        few = np.flatnonzero(counts < 3)
+        raise InputError(
+            f"polygons of three corners or more expected, {len(corners)} corners in all", file=file,
+            field=f"faces, face {few[0]}" if len(few) else "faces",
+            value=f"{counts[few[0]]} corners" if len(few) else f"{counts.sum(dtype=np.float64):.0f} corners",
+            mend="delete such faces, or export the mesh again",
+        )  # fmt: skip
+    starts = np.cumsum(counts, dtype=np.int64) - counts
+    kept = np.ones(len(counts), bool)
+    kept[[i for i in skip if 0 <= i < len(counts)]] = False
+    first = np.cumsum(np.where(kept, counts - 2, 0), dtype=np.int64) - np.where(kept, counts - 2, 0)
+    triangles = np.empty((int(np.where(kept, counts - 2, 0).sum()), 3), np.int32)
+    for n in np.unique(counts[kept]):
+        number = np.flatnonzero(kept & (counts == n))
+        polygons = np.asarray(corners)[starts[number, None] + np.arange(n)]
+        triangles[first[number, None] + np.arange(n - 2)] = _equal(file, x, polygons, number)
+    return triangles
+
+
+def _equal(file: Path, x: np.ndarray, polygons: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Triangles (P, n - 2, 3) of polygons (P, n), whose numbers are for an error."""
+    n = polygons.shape[1]
+    fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
+    if n == 3:
+        return polygons[:, fan]
+    places = x[polygons]
+    with np.errstate(all="ignore"):  # what is not finite is told of later
+        places = places - places[:, :1]
+        normal = np.cross(places, np.roll(places, -1, axis=1)).sum(axis=1)  # twice the area
+        area = np.linalg.norm(normal, axis=1)
+        unit = normal / np.where(area > 0, area, 1)[:, None]
+        size = np.abs(places).max(axis=(1, 2)) ** 2
+
+    def faces_up(cut: np.ndarray) -> np.ndarray:
+        a, b, c = (places[:, cut[:, k]] for k in range(3))
+        with np.errstate(all="ignore"):
+            return (np.einsum("pti,pi->pt", np.cross(b - a, c - a), unit) > 1e-9 * size[:, None]).all(axis=1)
+
+    turned = (fan + 1) % n
+    first = faces_up(fan) | ~(area > 1e-9 * size)
+    result = np.where(first[:, None, None], polygons[:, fan], polygons[:, turned])
+    for p in np.flatnonzero(~first & ~faces_up(turned)):
+        result[p] = polygons[p][_ears(file, places[p], unit[p], int(number[p]))]
+    return result
+
+
+def _ears(file: Path, x: np.ndarray, unit: np.ndarray, number: int) -> np.ndarray:
+    """Triangles (n - 2, 3) of one polygon (n, 3), the roundest ear first, so that none is a sliver that need not be."""
+    across = np.eye(3)[np.abs(unit).argmin()]
+    u = np.cross(across, unit)
+    flat = np.stack([x @ u, x @ np.cross(unit, u)], axis=1)
+    left, cut = list(range(len(x))), []
+    least = 1e-9 * np.abs(x).max() ** 2
+    while len(left) > 2:
+        a, b, c = (flat[np.roll(left, k)] for k in (1, 0, -1))
+        area = _cross(b - a, c - b)
+        fat = area / sum(np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a)))
+        ears = (
+            k
+            for k in np.argsort(-fat, kind="stable").tolist()
+            if area[k] > least and not _holds(a[k], b[k], c[k], flat[[v for v in left if v not in _around(left, k)]])
+        )
+        line = area.max() <= least and area.min() >= -least  # what is left has no area
+        ear = int(area.argmax()) if line else next(ears, None)
+        if ear is None:
+            raise InputError(
+                "a polygon that does not cross itself expected", file=file, field=f"faces, face {number}",
+                value=f"{len(x)} corners", mend="triangulate it where the mesh was made",
+            )  # fmt: skip
+        cut.append(_around(left, ear))
+        del left[ear]
+    return np.array(cut)
+
+
+def _around(left: list[int], k: int) -> list[int]:
+    return [left[k - 1], left[k], left[(k + 1) % len(left)]]
+
+
+def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+
+
+def _holds(a: np.ndarray, b: np.ndarray, c: np.ndarray, points: np.ndarray) -> bool:
+    """Whether a point lies in the triangle or on its border, but at no corner, where the sides of a bridge to a hole meet."""
+    points = points[(points != a).any(axis=1) & (points != b).any(axis=1) & (points != c).any(axis=1)]
+    inside = (_cross(b - a, points - a) >= 0) & (_cross(c - b, points - b) >= 0) & (_cross(a - c, points - c) >= 0)
+    return bool(inside.any())
