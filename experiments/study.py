@@ -74,7 +74,8 @@ def standing(scene: Scene, motions: Sequence[str], kept: Path) -> tuple[str, ...
     found = []
     for motion in motions:
         file, record = kept / "motions" / f"{stem(motion)}.npz", read_motion(scene.path(motion))
-        if len(record.poses) > record.fps and not np.any(record.poses[-round(record.fps / 2) :] - record.poses[-1]):
+        plain = record.joints is None and not record.up  # of another skeleton or another up, its file says more
+        if plain and len(record.poses) > record.fps and not np.any(record.poses[-round(record.fps / 2) :] - record.poses[-1]):
             poses, way = (
                 np.concatenate([a, np.repeat(a[-1:], round(STAND * record.fps), axis=0)])
                 for a in (record.poses, record.translation)

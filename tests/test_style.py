@@ -29,6 +29,7 @@ BELOW: dict[str, set[str]] = {
     "modes": set(),
     "networks": set(),
     "kinematics": set(),
+    "joint_names": set(),
     "rotations": {"numerics"},
     "vectors": {"numerics"},
     "mesh": {"numerics", "vectors"},

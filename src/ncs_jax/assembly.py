@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.casting import cast
 from ncs_jax.energies.collision import Surface, surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
@@ -75,36 +76,30 @@ class Assembly:
 
 
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
-    """A motion at the scene's frame rate, checked against the body's skeleton."""
-    path = scene.path(name)
-    record = io.read_motion(path)
-    joints = 1 if body is None else len(body.parents)
-    poses = record.poses
-    if poses.shape[1] != joints:
-        raise InputError(
-            f"{joints} joints expected, as the body has", file=path, field="poses", value=f"{poses.shape[1]} joints",
-            mend="give a motion of this skeleton",
-        )  # fmt: skip
-    if body is not None and body.joint_names and record.joint_names and record.joint_names != body.joint_names:
-        order = {n: i for i, n in enumerate(record.joint_names)}
-        missing = [n for n in body.joint_names if n not in order]
-        if missing:
-            raise InputError("joint missing that the body has", file=path, field="joint_names", value=missing[0])
-        poses = poses[:, [order[n] for n in body.joint_names]]
+    """A motion at the scene's frame rate, of the body's joints, see `casting.cast`."""
+    path, spec = scene.path(name), scene.motion
+    chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
+    gravity = np.array(scene.physics.gravity)
+    try:
+        record = cast(io.read_motion(path, frame_range=chosen), body, spec, "z" if np.abs(gravity).argmax() == 2 else "y")
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise InputError(error.expected, file=path, field=error.field, value=error.value, mend=error.mend) from None
     speed = np.abs(np.diff(record.translation, axis=0)).max(initial=0) * record.fps
     if speed > 100:
         raise InputError(
             "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
-            mend="divide centimetres by 100",
+            mend="divide centimetres by 100, or say motion.scale = 0.01",
         )  # fmt: skip
-    translation = record.translation
+    poses, translation = record.poses, record.translation
     if record.fps != scene.motion.fps:
         begin = translation[:1].astype(np.float64)
         poses, moved = resample(
             jnp.asarray(poses, jnp.float32), jnp.asarray(translation - begin, jnp.float32), float(record.fps), scene.motion.fps
         )
         translation = begin + np.asarray(moved)
-    return io.MotionRecord(np.asarray(poses), np.asarray(translation), scene.motion.fps, record.joint_names)
+    return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=scene.motion.fps)
 
 
 def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:

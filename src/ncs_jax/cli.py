@@ -8,6 +8,7 @@ import math
 import os
 import re
 import sys
+import textwrap
 from pathlib import Path
 
 from ncs_jax.errors import InputError
@@ -461,6 +462,8 @@ def _check(options) -> int:
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
         for name in names:
             print(f"  {kind:9} {name}: {len(assembly.motions[name].poses)} frames at {model.fps:g} per second")
+            for note in assembly.motions[name].notes:
+                print(textwrap.fill(note, 128, initial_indent=12 * " ", subsequent_indent=14 * " "))
     if not model.moves:
         print("  the character never moves: only the static network is trained")
     found = findings(assembly)

@@ -79,6 +79,12 @@ class MotionSpec:
     validation: tuple[str, ...] = _f((), "motions that are only looked at")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
     mirror: bool = _f(False, "train on the mirror image of every motion too")
+    frames: tuple[int, ...] = _f(
+        (), "first frame, and the one after the last, of every file; empty: all of it", low=0, high=10**9
+    )
+    scale: float = _f(0.0, "m for each unit of a file's lengths; 0: metres, of another skeleton by its legs", low=0, high=1e6)
+    up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"))
+    joints: dict[str, str] = _f({}, 'the body\'s joint for a joint of a motion, where names do not tell; "": none')
 
 
 @dataclass(frozen=True)
@@ -277,6 +283,8 @@ def scene_from(tables: dict, source: str = "") -> Scene:
     gravity = scene.physics.gravity
     if len(gravity) != 3:
         raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
+    if len(scene.motion.frames) > 2:
+        raise InputError("one or two numbers expected", file=source, field="motion.frames", value=list(scene.motion.frames))
     for name in ("static", "decoder"):
         if not getattr(scene.network, name):
             raise InputError("at least one layer expected", file=source, field=f"network.{name}", value=[])
@@ -348,6 +356,10 @@ def _value(kind, value, meta, source, where):
             raise InputError("a list expected", file=source, field=where, value=value)
         item = typing.get_args(kind)[0]
         return tuple(_value(item, v, meta, source, f"{where}[{i}]") for i, v in enumerate(value))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise InputError("a table expected", file=source, field=where, value=value, mend='write { "theirs" = "ours" }')
+        return {k: _value(typing.get_args(kind)[1], v, meta, source, f"{where}.{k}") for k, v in value.items()}
     if kind is str and isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     number = isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,4 +1,4 @@
-"""Skinned bodies from .npz, in this package's layout or that of SMPL and the published neural cloth simulation."""
+"""Skinned bodies from .npz: this package's layout, the published neural cloth simulation's, or a SMPL family model file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.files import LARGEST
 from ncs_jax.io.npz import read_npz
 from ncs_jax.io.records import BodyRecord
-from ncs_jax.io.table import Table, indices
+from ncs_jax.io.smpl import smpl_names, smpl_parents
+from ncs_jax.io.table import Table, indices, tree
 
 __all__ = ["read_body"]
 
@@ -18,6 +19,12 @@ FIELDS = (
     "vertices", "faces", "joints", "parents", "blend_weights", "weight_joints", "weights", "joint_names", "rest_rotations",
     "rest_pose",
 )  # fmt: skip
+MODEL = ("v_template", "f", "weights", "kintree_table", "J_regressor")
+SPARSE = ("J_regressor_data", "J_regressor_indices", "J_regressor_indptr")  # of a scipy.sparse matrix
+CONVERT = """\
+python -c "import pickle, numpy as np; m = pickle.load(open({old!r}, 'rb'), encoding='latin1'); \
+np.savez({new!r}, **{{k: np.array(m[k].toarray() if hasattr(m[k], 'toarray') else m[k]) for k in {fields!r}}})\
+\""""
 
 
 def read_body(path: str | Path) -> BodyRecord:
@@ -28,11 +35,24 @@ def read_body(path: str | Path) -> BodyRecord:
     (J, 3, 3) may be there. The root's parent is -1, or as SMPL files have it 0 or 4294967295. Rows of weights that sum to 1
     within 1e-3 are divided by their sum.
 
+    A model file of SMPL, SMPL-H or SMPL-X is read as it is distributed, `v_template` (V, 3), `f` (F, 3), `weights` (V, J),
+    `kintree_table` (2, J) and `J_regressor`, (J, V) or the three arrays of a sparse one with `_data`, `_indices` and `_indptr`
+    after its name: the mean shape, its joints J_regressor v_template. Shape and pose correctives are not applied. A .pkl runs
+    whatever code is in it, so it is refused with the command that makes a .npz of it.
+
     Raises:
         InputError: the file cannot be read; or shapes disagree, a number is not finite or names nothing, the joints are not one
             tree with parents before children, or weights are negative or do not sum to 1.
     """
-    table = read_npz(path, FIELDS.__contains__)
+    if Path(path).suffix.lower() in (".pkl", ".pickle"):
+        convert = CONVERT.format(old=str(path), new=str(Path(path).with_suffix(".npz")), fields=MODEL)
+        raise InputError(
+            "an .npz expected: a pickle may run any code, so none is ever loaded", file=path, value=Path(path).suffix,
+            mend=f"where you trust it, make one (a few of these files need `pip install chumpy` for it): {convert}",
+        )  # fmt: skip
+    table = read_npz(path, {*FIELDS, *MODEL, *SPARSE}.__contains__)
+    if "v_template" in table:
+        table = _model(table)
     vertices = table.floats("vertices", ("V", 3), ("vertex",))
     joints = table.floats("joints", ("J", 3), ("joint",))
     faces = table.indices("faces", ("F", 3), len(vertices), "vertices")
@@ -48,31 +68,52 @@ def read_body(path: str | Path) -> BodyRecord:
             mend="write vertices and joints unposed, and rest_pose as zeros",
         )  # fmt: skip
     return BodyRecord(
-        vertices, faces, joints, _parents(table, len(joints), names), _weights(table, len(vertices), len(joints)), names,
-        _rest_rotations(table, len(joints)),
+        vertices, faces, joints, tree(table.file, "parents", table.array("parents"), len(joints), names),
+        _weights(table, len(vertices), len(joints)), names, _rest_rotations(table, len(joints)),
     )  # fmt: skip
 
 
-def _parents(table: Table, joints: int, names: tuple[str, ...]) -> np.ndarray:
-    array = table.array("parents")
-    if array.dtype.kind not in "iu" or array.shape != (joints,):
+def _model(table: Table) -> Table:
+    """A model file of the SMPL family in this package's layout."""
+    vertices = table.floats("v_template", ("V", 3), ("vertex",))
+    kintree = table.array("kintree_table")
+    if kintree.ndim != 2 or len(kintree) != 2:
+        raise InputError("shape (2, J) expected", file=table.file, field="kintree_table", value=kintree.shape)
+    parents = tree(table.file, "kintree_table", kintree[0], kintree.shape[1])
+    count = len(parents)
+    if "J_regressor" in table:
+        joints = table.floats("J_regressor", (count, len(vertices)), ("joint",)) @ vertices
+    else:
+        table.first("J_regressor", *SPARSE[:1])
+        joints = _sparse_rows(table, count, len(vertices)) @ vertices
+    names = smpl_names(count) if np.array_equal(parents, smpl_parents(count)) else ()
+    arrays = {
+        "vertices": vertices, "faces": table.array("f"), "joints": joints, "parents": parents,
+        "blend_weights": table.floats("weights", (len(vertices), count), ("vertex", "joint")),
+    }  # fmt: skip
+    return Table(table.file, arrays | ({"joint_names": np.array(names)} if names else {}), table.names)
+
+
+def _sparse_rows(table: Table, joints: int, vertices: int) -> np.ndarray:
+    """The regressor (joints, vertices) from its parts, compressed by joint (CSR) or by vertex (CSC), as their lengths tell."""
+    data = table.floats(SPARSE[0], ("N",))
+    pointer = indices(table.file, SPARSE[2], table.array(SPARSE[2]), ("P",), len(data) + 1, "entries")
+    by_joint = len(pointer) == joints + 1
+    if not by_joint and len(pointer) != vertices + 1:
         raise InputError(
-            f"whole numbers of shape ({joints},) expected, one for each of the joints", file=table.file, field="parents",
-            value=f"{array.dtype} {array.shape}", mend="write the parent of each joint",
+            f"{joints + 1} or {vertices + 1} numbers expected, one more than joints or vertices", file=table.file,
+            field=SPARSE[2], value=len(pointer), mend="write J_regressor dense",
         )  # fmt: skip
-    given = [int(p) for p in array]
-    none = {-1, 2**32 - 1} | ({int(np.iinfo(array.dtype).max)} if array.dtype.kind == "u" else set())
-    parents = [-1 if p in none or (j == 0 and p == 0) else p for j, p in enumerate(given)]
-    for j, p in enumerate(parents):
-        if (p == -1) != (j == 0) or p >= j:
-            raise InputError(
-                "one root, joint 0 with parent -1, and parents before their children expected", file=table.file,
-                field=f"parents, joint {j}" + (f" {names[j]}" if names else ""), value=given[j],
-                mend="sort the joints from the root outward",
-            )  # fmt: skip
-        if p < -1:
-            raise InputError("a joint or -1 expected", file=table.file, field=f"parents, joint {j}", value=given[j])
-    return np.array(parents, dtype=np.int32)
+    if pointer[0] != 0 or pointer[-1] != len(data) or np.any(np.diff(pointer) < 0):
+        raise InputError(f"numbers that rise from 0 to {len(data)} expected", file=table.file, field=SPARSE[2])
+    other, what = (vertices, "vertices") if by_joint else (joints, "joints")
+    inner = indices(table.file, SPARSE[1], table.array(SPARSE[1]), data.shape, other, what)
+    outer = np.repeat(np.arange(len(pointer) - 1), np.diff(pointer))
+    if joints * vertices * data.itemsize > LARGEST:
+        raise InputError("a smaller body expected", file=table.file, field=SPARSE[0], value=f"{vertices} vertices")
+    dense = np.zeros((joints, vertices), data.dtype)
+    np.add.at(dense, (outer, inner) if by_joint else (inner, outer), data)
+    return dense
 
 
 def _weights(table: Table, vertices: int, joints: int) -> np.ndarray:

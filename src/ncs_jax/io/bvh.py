@@ -24,14 +24,16 @@ class Bvh:
 
     Attributes:
         file: where it is from. joint_names: J names, root first; end sites are no joints. parents: (J,) int32, -1 for the root.
-        offsets: (J, 3) of each joint from its parent in the rest pose; the root's own is where it rests. poses: (T, J, 3) local
-            rotations since rest, axis times angle. positions: (T, 3) of the root. fps: frames per second.
+        offsets: (J, 3) of each joint from its parent in the rest pose; the root's own is where it rests. tips: (J, 3) of an end
+            site from its joint; NaN where a joint has none. poses: (T, J, 3) local rotations since rest, axis times angle.
+            positions: (T, 3) of the root. fps: frames per second.
     """
 
     file: Path
     joint_names: tuple[str, ...]
     parents: np.ndarray
     offsets: np.ndarray
+    tips: np.ndarray
     poses: np.ndarray
     positions: np.ndarray
     fps: float
@@ -46,7 +48,7 @@ def read_bvh(path: str | Path) -> Bvh:
     parts = re.split(r"^\s*MOTION\s*$", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
     if len(parts) != 2:
         raise InputError("HIERARCHY and then MOTION expected", file=file, field="MOTION", mend="export the .bvh again")
-    names, parents, offsets, channels = _hierarchy(file, parts[0])
+    names, parents, offsets, tips, channels = _hierarchy(file, parts[0])
     values, fps = _motion(file, parts[1], sum(map(len, channels)))
     poses = np.zeros((len(values), len(names), 3))
     positions = np.broadcast_to(offsets[0], (len(values), 3)).copy()
@@ -68,13 +70,14 @@ def read_bvh(path: str | Path) -> Bvh:
                         mend="export rotations only, but for the root",
                     )  # fmt: skip
             poses[:, j] = to_axis_angle(turn)
-    return Bvh(file, tuple(names), np.array(parents, np.int32), offsets, poses, positions, fps)
+    return Bvh(file, tuple(names), np.array(parents, np.int32), offsets, tips, poses, positions, fps)
 
 
-def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray, list[list[tuple[str, int]]]]:
+def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray, np.ndarray, list[list[tuple[str, int]]]]:
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
+    tips: list[list[float]] = []
     channels: list[list[tuple[str, int]]] = []
     open_joints: list[int] = []  # -1 stands for an end site
     words = _words(file, text)
@@ -93,6 +96,7 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
             open_joints.append(len(names))
             names.append(name)
             offsets.append([])
+            tips.append([np.nan] * 3)
             channels.append([])
         elif key == "end":
             _until_brace(words)
@@ -103,6 +107,8 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
             offset = [_number(file, *next(words)) for _ in range(3)]
             if open_joints[-1] >= 0:
                 offsets[open_joints[-1]] = offset
+            elif len(open_joints) > 1 and open_joints[-2] >= 0:
+                tips[open_joints[-2]] = offset
         elif key == "channels" and open_joints and open_joints[-1] >= 0:
             count = _number(file, *next(words))
             if count not in range(7):
@@ -126,7 +132,7 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
         raise InputError(
             "one skeleton expected", file=file, field=f"line {left[0]}", value=left[1], mend="export one character"
         )
-    return names, parents, np.array(offsets), channels
+    return names, parents, np.array(offsets), np.array(tips), channels
 
 
 def _words(file: Path, text: str) -> Iterator[tuple[int, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +13,22 @@ from ncs_jax.io.hdf5 import read_hdf5
 from ncs_jax.io.npz import read_npz
 from ncs_jax.io.quaternions import to_axis_angle
 from ncs_jax.io.records import MotionRecord
-from ncs_jax.io.table import Table, floats, select
+from ncs_jax.io.table import Table, floats, select, tree
 
 __all__ = ["read_motion"]
 
 FPS = ("fps", "mocap_framerate", "mocap_frame_rate")
-FIELDS = ("poses", "quaternions", "trans", "joint_names", *FPS)
+PARTS = ("root_orient", "pose_body", "pose_jaw", "pose_eye", "pose_hand")  # of AMASS, in the order of SMPL-X's joints
+FIELDS = ("poses", "quaternions", "trans", "joint_names", "joints", "parents", *PARTS, *FPS)
 FORMATS = (".npz", ".h5", ".hdf5", ".bvh")
+
+
+class Skeleton(NamedTuple):
+    """Fields of a MotionRecord."""
+
+    joints: np.ndarray | None
+    parents: np.ndarray | None
+    tips: np.ndarray | None
 
 
 def read_motion(
@@ -27,12 +37,14 @@ def read_motion(
     """A motion as local rotations since rest, axis times angle, and the root's translation since rest.
 
     .npz and .h5 hold `poses` (T, J, 3) or (T, 3 J), or `quaternions` (T, J, 4) with w first and of any length but zero; `trans`
-    (T, 3); and `fps`, in AMASS `mocap_framerate`. `joint_names` (J,) may be there. A .bvh names its joints; its translation is
+    (T, 3); and `fps`, in AMASS `mocap_framerate` or `mocap_frame_rate`, whose world has Z up. AMASS may have its poses in
+    parts: `root_orient` (T, 3), `pose_body` (T, 63), and `pose_hand` (T, 90) with or without `pose_jaw` and `pose_eye`.
+    `joint_names` (J,) may be there, and the skeleton, `joints` (J, 3) with `parents` (J,). A .bvh has both; its translation is
     the root's position less the root's OFFSET.
 
     Args:
         path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end. Other frames may be
-            broken. scale: metres per unit of the file's translation, for .bvh often 0.01 or 0.0254; the file cannot tell.
+            broken. scale: metres per unit of the file's lengths, for .bvh often 0.01 or 0.0254.
 
     Raises:
         InputError: the file cannot be read; or shapes disagree, a chosen frame has a number that is not finite or a quaternion
@@ -43,13 +55,23 @@ def read_motion(
         raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
     if not 0 < scale < 1e6:
         raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
+    skeleton, up = Skeleton(None, None, None), ""
     if suffix == ".bvh":
         bvh = read_bvh(path)
         file, poses, translation, fps, names = bvh.file, bvh.poses, bvh.positions - bvh.offsets[0], bvh.fps, bvh.joint_names
+        joints = bvh.offsets.copy()
+        for j, parent in enumerate(bvh.parents[1:], 1):
+            joints[j] += joints[parent]
+        skeleton = Skeleton(joints * scale, bvh.parents, (joints + bvh.tips) * scale)
     else:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
         file, poses, translation, fps = table.file, _rotations(table), table.array("trans"), table.number(*FPS)
         names = table.joint_names(poses.shape[1])
+        up = "" if "fps" in table else "z"
+        if "parents" in table and "joints" in table:
+            joints = table.floats("joints", (poses.shape[1], 3), ("joint",))
+            parents = tree(file, "parents", table.array("parents"), poses.shape[1], names)
+            skeleton = Skeleton(joints * joints.dtype.type(scale), parents, None)
         if translation.shape != (len(poses), 3):
             raise InputError(
                 f"an array of shape ({len(poses)}, 3) expected, one row a frame", file=file, field="trans",
@@ -62,11 +84,13 @@ def read_motion(
     if poses.shape[2] == 4:
         poses = _from_quaternions(file, poses, labels, chosen.start)
     moved = floats(file, "trans", translation[chosen], ("T", 3), ("frame",), chosen.start)
-    return MotionRecord(poses, moved * moved.dtype.type(scale), fps, names)
+    return MotionRecord(poses, moved * moved.dtype.type(scale), fps, names, *skeleton, up)
 
 
 def _rotations(table: Table) -> np.ndarray:
     """Poses (T, J, 3) or quaternions (T, J, 4), unchecked but for their shape."""
+    if "poses" not in table and "quaternions" not in table and "root_orient" in table:
+        return _in_parts(table)
     name = table.first("poses", "quaternions")
     if name == "poses" and "quaternions" in table:
         raise InputError("either poses or quaternions expected", file=table.file, field="poses", mend="leave one out")
@@ -84,6 +108,20 @@ def _rotations(table: Table) -> np.ndarray:
     if len(array) == 0:
         raise InputError("at least one frame expected", file=table.file, field=name, value=array.shape, mend="write it again")
     return array
+
+
+def _in_parts(table: Table) -> np.ndarray:
+    """Poses of AMASS that are written by part: SMPL-H without jaw and eyes, SMPL-X with them, or the body's 22 joints alone."""
+    frames, face = len(table.array("root_orient")), "pose_jaw" in table or "pose_eye" in table
+    width = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
+    parts = [table.floats(name, (frames, width[name]), ("frame",)) for name in ("root_orient", "pose_body")]
+    if face or "pose_hand" in table:
+        for name in PARTS[2:] if face else PARTS[4:]:
+            here = name in table
+            parts.append(table.floats(name, (frames, width[name]), ("frame",)) if here else np.zeros((frames, width[name])))
+    if frames == 0:
+        raise InputError("at least one frame expected", file=table.file, field="root_orient", mend="write it again")
+    return np.concatenate(parts, axis=1).reshape(frames, -1, 3)
 
 
 def _from_quaternions(file: Path, q: np.ndarray, labels: list[str], start: int) -> np.ndarray:

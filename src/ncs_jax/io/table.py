@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["Table", "floats", "indices", "select"]
+__all__ = ["Table", "floats", "indices", "select", "tree"]
 
 Shape = tuple[int | str, ...]
 
@@ -75,6 +75,28 @@ def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int,
             value=int(array[tuple(where)]), mend="counting starts at 0; write only those that exist",
         )  # fmt: skip
     return array.astype(np.int32)
+
+
+def tree(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[str, ...] = ()) -> np.ndarray:
+    """The parent of each joint, (joints,) int32: one root, joint 0 with -1, and parents before their children."""
+    if array.dtype.kind not in "iu" or array.shape != (joints,):
+        raise InputError(
+            f"whole numbers of shape ({joints},) expected, one for each of the joints", file=file, field=field,
+            value=f"{array.dtype} {array.shape}", mend="write the parent of each joint",
+        )  # fmt: skip
+    given = [int(p) for p in array]
+    none = {-1, 2**32 - 1} | ({int(np.iinfo(array.dtype).max)} if array.dtype.kind == "u" else set())
+    parents = [-1 if p in none or (j == 0 and p == 0) else p for j, p in enumerate(given)]
+    for j, p in enumerate(parents):
+        if (p == -1) != (j == 0) or p >= j:
+            raise InputError(
+                "one root, joint 0 with parent -1, and parents before their children expected", file=file,
+                field=f"{field}, joint {j}" + (f" {names[j]}" if names else ""), value=given[j],
+                mend="sort the joints from the root outward",
+            )  # fmt: skip
+        if p < -1:
+            raise InputError("a joint or -1 expected", file=file, field=f"{field}, joint {j}", value=given[j])
+    return np.array(parents, dtype=np.int32)
 
 
 def select(file: Path, frames: int, frame_range: tuple[int, int | None] | None) -> slice:
