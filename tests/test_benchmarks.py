@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import growth, inference, quality, simulator, training, work
+from benchmarks import growth, inference, quality, simulator, start, training, work
 from benchmarks.cost import counted
 from benchmarks.measure import COPIES, Limits, Work, apart, looped, nudged, table, timed
 from experiments import seeds
@@ -37,6 +37,18 @@ def figures(benchmark, folder, *options):
         assert row["share"] == pytest.approx(row["least"] / t["median"]) and row["share"] > 0
     assert benchmark.main([str(folder / "nowhere.toml")]) == 2  # which is no scene
     return result
+
+
+def test_start(tmp_path, capsys):
+    train(write_scene(tmp_path), tmp_path / "run", steps=10)
+    assert start.main([str(tmp_path / "run"), "--repeats", "1", "--json", str(tmp_path / "x.json")]) == 0
+    rows = json.loads((tmp_path / "x.json").read_text())
+    assert list(rows) == ["import jax", "import ncs_jax", "load_run", "first frame", "all"]
+    assert all(row["wall"] > 0 and row["cpu"] > 0 for row in rows.values())
+    assert rows["all"]["wall"] == pytest.approx(sum(row["wall"] for row in list(rows.values())[:4]))
+    assert "first frame" in capsys.readouterr().out
+    assert start.main([str(tmp_path), "--repeats", "1"]) == 2
+    assert "no run there" in capsys.readouterr().err
 
 
 def test_training(tmp_path, capsys):

@@ -352,6 +352,22 @@ def test_animate_with_a_smaller_decoder_tells_the_error(run_folder, tmp_path, ca
     assert not (tmp_path / "c.npz").exists()
 
 
+def test_export_says_what_it_wrote_and_how_far_it_is(run_folder, tmp_path, capsys):
+    _, folder = run_folder
+    out = tmp_path / "step.onnx"
+    assert main(["export", str(folder), "--out", str(out), "--rank", "3", "--opset", "17"]) == 0
+    text = capsys.readouterr().out
+    assert f"{out}: onnx, opset 17" in text and f"{out}.json says how" in text
+    assert "24 frames" in text and "ms each; at most" in text and "mm from the whole network" in text
+    assert main(["export", str(folder), "--out", str(tmp_path / "step"), "--format", "stablehlo"]) == 0
+    text = capsys.readouterr().out
+    assert "stablehlo" in text and "whole" not in text and (tmp_path / "step.json").exists()
+    assert main(["export", str(folder), "--out", str(out), "--rank", "1000"]) == 2
+    one_line(capsys, ["--rank", "1000"])
+    assert main(["export", str(folder), "--out", str(out), "--opset", "3"]) == 2
+    one_line(capsys, ["--opset", "13 to 21", "3"])
+
+
 def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, monkeypatch):
     _, folder = run_folder
     np.savez(tmp_path / "other.npz", **swing(frames=9))

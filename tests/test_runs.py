@@ -14,6 +14,7 @@ import pytest
 
 from ncs_jax.devices import free_memory
 from ncs_jax.errors import InputError
+from ncs_jax.rollout import stepper
 from ncs_jax.runs import load_run, train
 
 from .scenes import write_scene
@@ -146,3 +147,18 @@ def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_pa
     monkeypatch.undo()
     assert free_memory() > 10**6
     train(scene, out, steps=10)
+
+
+def test_a_first_frame_takes_few_programs(tmp_path, plain_jax):
+    """Each costs a process that starts some 10 ms, cached or not; array by array, loading would compile over fifty."""
+    train(write_scene(tmp_path), tmp_path / "run", steps=10)
+    compiled: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
+    jax.clear_caches()
+    compiled.clear()
+    run = load_run(tmp_path / "run")
+    init, step = stepper(run.assembly.model, run.assembly.network, run.params)
+    eye = np.broadcast_to(np.eye(3, dtype=np.float32), (2, 3, 3))
+    jax.block_until_ready(jax.jit(step)(init(), eye, np.zeros(3, np.float32), 1.0))
+    count = compiled.count("/jax/core/compile/backend_compile_duration")
+    assert 2 <= count <= 12

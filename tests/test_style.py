@@ -19,9 +19,18 @@ MODULES = {
 }
 MODULES["ncs_jax"] = MODULES.pop("__init__")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
-HEAVY = {"trimesh", "h5py", "matplotlib", "PIL", "rich", "orbax", "pxr", "tensorboardX"}
+HEAVY = {"trimesh", "h5py", "matplotlib", "PIL", "rich", "orbax", "pxr", "tensorboardX", "onnx", "onnxruntime", "flatbuffers"}
 PICTURES = {"pictures", "rasteriser", "preview", "viewer"}  # these exist to draw
-OUTSIDE = {"io", "scene", "assembly", "checkpoint", "runs", "simulation", "cli"} | PICTURES  # read files, print or draw
+OUTSIDE = {
+    "io",
+    "scene",
+    "assembly",
+    "checkpoint",
+    "export",
+    "runs",
+    "simulation",
+    "cli",
+} | PICTURES  # read files, print or draw
 
 # What each part of the numeric core may import of the package: itself, and what stands below it.
 BELOW: dict[str, set[str]] = {

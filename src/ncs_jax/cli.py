@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, animate, simulate, evaluate, check."""
+"""The command line: ncs demo, train, animate, export, simulate, evaluate, check."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs demo                          train the packaged T-shirt and write a preview to look at
   ncs train SCENE --out RUN         train the garment of a scene file (ncs:tshirt and ncs:skirt come with the package)
   ncs animate RUN --out FILE        animate a trained garment
+  ncs export RUN --out FILE         write its step for a game engine or another host, as ONNX or StableHLO
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
@@ -88,6 +89,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     animate.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
     animate.add_argument("--out", required=True, metavar="FILE", help=FORMATS)
+
+    export = command("export", _export, "write one step of a trained garment for a host that has neither JAX nor this package")
+    export.add_argument("folder", metavar="RUN", help="folder that ncs train made")
+    export.add_argument("--format", choices=("onnx", "stablehlo"), default="onnx", help="default: onnx")
+    export.add_argument("--out", required=True, metavar="FILE", help="the file; what a host has to know goes to FILE.json")
+    export.add_argument("--motion", metavar="FILE", help="to check it on and to fit --rank to (default: one of the scene's)")
+    export.add_argument("--rank", type=_whole, default=0, help="a smaller decoder: its rank, say 64; prints the error")
+    export.add_argument("--float16", action="store_true", help="store weights in 16 bits (computed in 32); prints the error")
+    export.add_argument("--opset", type=_whole, default=15, help="of the ONNX operators, 13 to 21 (default: 15)")
 
     simulate = command("simulate", _simulate, "animate the garment of a scene by full-space simulation, without a network")
     simulate.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
@@ -301,10 +311,7 @@ def _animate(options) -> int:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
     vertices, error = run.animate(motions[0], options.alpha), ""
     if options.rank or options.bfloat16:
-        try:
-            smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
-        except ValueError as fault:
-            raise InputError(str(fault), field="--rank", value=options.rank) from fault
+        smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
         whole, vertices = vertices, smaller.animate(motions[0], options.alpha)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
@@ -313,6 +320,14 @@ def _animate(options) -> int:
     print(
         f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices{error}"
     )
+    return 0
+
+
+def _export(options) -> int:
+    from ncs_jax.runs import load_run
+
+    chosen = {name: getattr(options, name) for name in ("format", "rank", "float16", "opset", "motion")}
+    print(load_run(options.folder).export(options.out, **chosen))
     return 0
 
 

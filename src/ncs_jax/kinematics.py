@@ -108,7 +108,7 @@ def blend_from(dense: np.ndarray, most: int = 8, dtype=jnp.float32) -> Blend:
     dense = dense / dense.sum(axis=1, keepdims=True)
     used = np.flatnonzero(dense.max(axis=0) > 1e-4)
     kept = dense[:, used]
-    return Blend(jnp.asarray(kept / kept.sum(axis=1, keepdims=True), dtype), tuple(int(j) for j in used))
+    return Blend(jax.device_put((kept / kept.sum(axis=1, keepdims=True)).astype(dtype)), tuple(int(j) for j in used))
 
 
 def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[Array, "verts 3 4 *poses"]:

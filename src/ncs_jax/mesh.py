@@ -209,12 +209,12 @@ def mesh_from(
     with jax.enable_x64(True):
         areas = jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))
         angle = np.asarray(jax.jit(lambda x, i, a: dihedral(corners(x, i), [a[:, 0], a[:, 1]]))(jnp.asarray(x), hinges, areas))
-    array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
+    array = lambda a: jax.device_put(np.asarray(a, dtype))  # noqa: E731, without a program for every shape
     return Mesh(
         rest=array(x),
-        faces=jnp.asarray(faces),
-        edges=jnp.asarray(edges),
-        hinges=jnp.asarray(hinges),
+        faces=jax.device_put(faces),
+        edges=jax.device_put(edges),
+        hinges=jax.device_put(hinges),
         face_area=array(area),
         face_axes=array(axes),
         vertex_area=array(vertex_area),
@@ -237,12 +237,12 @@ def _rings(faces, edges, hinges, sides, verts: int, dtype) -> Rings:
         after = around[each, (corner + 1) % 3]
         turned[sides[:, side], corner] = np.where(after == hinges[:, side], 1, -1)
     return Rings(
-        jnp.asarray(_places(faces, verts)),
-        jnp.asarray(_places(edges, verts)),
-        jnp.asarray(folds),
-        jnp.asarray(turned, dtype),
-        jnp.asarray(sides, jnp.int32),
-        jnp.asarray(turned[sides[:, 1], corner], dtype),
+        jax.device_put(_places(faces, verts)),
+        jax.device_put(_places(edges, verts)),
+        jax.device_put(folds),
+        jax.device_put(turned.astype(dtype)),
+        jax.device_put(sides.astype(np.int32)),
+        jax.device_put(turned[sides[:, 1], corner].astype(dtype)),
     )
 
 

@@ -306,12 +306,15 @@ def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) ->
     """The same decoder with one linear map, for inference."""
     if not decoder.modes:
         return decoder, params
-    local, modal = params["offsets"], params["coefficients"]
 
-    def whole(a, c):
-        modal_part = jnp.matmul(basis, c.reshape(decoder.modes, -1), precision="highest")
-        return decoder.local * a + modal_part.reshape(a.shape)
+    @jax.jit  # one program to compile, not one an operation
+    def whole(local, modal, basis):
+        def added(a, c):
+            modal_part = jnp.matmul(basis, c.reshape(decoder.modes, -1), precision="highest")
+            return decoder.local * a + modal_part.reshape(a.shape)
 
-    offsets = {name: whole(local[name], modal[name]) for name in ("kernel", "bias")}
+        return {name: added(local[name], modal[name]) for name in ("kernel", "bias")}
+
+    offsets = whole(params["offsets"], params["coefficients"], basis)
     kept = {name: value for name, value in params.items() if name != "coefficients"}
     return Decoder(decoder.verts, decoder.sizes, 0, 1.0, decoder.dtype), {**kept, "offsets": offsets}

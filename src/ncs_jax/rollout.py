@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -58,11 +59,12 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
     g = model.material.gravity
 
     def init(*characters: int) -> State:
-        n = len(model.inputs)
-        eye = jnp.broadcast_to(jnp.eye(3, dtype=rest.dtype), (*characters, n, 3, 3))
-        joints = Joints(eye, eye, jnp.zeros((*characters, n, 3), rest.dtype))
-        state = State(jnp.zeros((*characters, network.state), rest.dtype), joints, joints, jnp.zeros(characters, bool))
-        return jax.tree.map(jnp.copy, state)  # no two of its arrays are one, so that a caller may donate it
+        n, new = len(model.inputs), partial(np.zeros, dtype=rest.dtype)
+        eye = np.broadcast_to(np.eye(3, dtype=rest.dtype), (*characters, n, 3, 3))
+        # From the host: nothing to compile, and no two arrays are one, so that a caller may donate the state.
+        previous, before = (Joints(*map(jax.device_put, (eye, eye, new((*characters, n, 3))))) for _ in range(2))
+        code, started = new((*characters, network.state)), np.zeros(characters, bool)
+        return State(jax.device_put(code), previous, before, jax.device_put(started))
 
     def look(previous: Joints, before: Joints, started, rotations, translation):
         """Of one character: the joints now and before, their transforms, and the descriptors."""

@@ -22,6 +22,7 @@ from ncs_jax.compression import compress
 from ncs_jax.devices import batch_mesh, compiled, copied, divided, give_back, local
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import BLOCK, measure, summarise
+from ncs_jax.export import Exported, export
 from ncs_jax.methods.swing import Swing
 from ncs_jax.motion import Track
 from ncs_jax.rollout import animate, first_broken
@@ -95,10 +96,49 @@ class Run:
         return x
 
     def compressed(self, motion: str | Track, *, rank: int = 0, bfloat16: bool = False) -> Run:
-        """This garment with a smaller decoder, made for what it does in a motion: see `compression.compress`."""
+        """This garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.
+
+        Raises:
+            InputError: the motion has no such rank.
+        """
         a, track = self.assembly, self.track(motion) if isinstance(motion, str) else motion
-        network, params = compress(a.network, self.params, a.model, track, rank=rank, bfloat16=bfloat16)
+        try:
+            network, params = compress(a.network, self.params, a.model, track, rank=rank, bfloat16=bfloat16)
+        except ValueError as fault:
+            raise InputError(str(fault), field="--rank", value=rank) from fault
         return replace(self, assembly=replace(a, network=network), params=params)
+
+    def export(
+        self,
+        file: str | Path,
+        *,
+        format: str = "onnx",
+        rank: int = 0,
+        float16: bool = False,
+        opset: int = 15,
+        motion: str | None = None,
+    ) -> Exported:
+        """Write one step for hosts without this package, checked over a motion: see `export.export`.
+
+        Args:
+            rank: of a smaller decoder, see `compressed`. motion: to be smaller for and to check on; else the scene's first one,
+                of those for validation if it has any.
+        """
+        scene = self.assembly.scene
+        motion = motion or next(iter((*scene.motion.validation, *scene.motion.files)), None)
+        if rank and motion is None:
+            raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+        smaller = self.compressed(motion, rank=rank) if rank else self
+        return export(
+            smaller.assembly,
+            smaller.params,
+            file,
+            format=format,
+            float16=float16,
+            opset=opset,
+            motion=None if motion is None else self.motion(motion),
+            trained=(self.assembly.network, self.params) if rank or float16 else None,
+        )
 
     def evaluate(self, motion: str | Track, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
         """Physical quantities per frame, see `evaluation.QUANTITIES` and `evaluation.measure`."""

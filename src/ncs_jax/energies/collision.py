@@ -122,17 +122,17 @@ def surface_from(
     border = np.zeros(len(body), bool)
     border[edges[sides[:, 1] < 0]] = True
     return Surface(
-        faces=jnp.asarray(faces, jnp.int32),
-        rings=jnp.asarray(vertex_rings(faces, len(body))),
-        face_edges=jnp.asarray(face_edges, jnp.int32),
-        edge_sides=jnp.asarray(sides),
-        border=jnp.asarray(border),
-        cloth_blocks=jnp.asarray(cloth_blocks),
-        cloth_place=jnp.asarray(place),
-        vertex_blocks=jnp.asarray(vertex_blocks),
-        vertex_lists=jnp.asarray(_lists(posed, cloth_blocks, vertex_blocks, groups)),
-        face_blocks=jnp.asarray(face_blocks),
-        face_lists=jnp.asarray(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
+        faces=jax.device_put(faces.astype(np.int32)),
+        rings=jax.device_put(vertex_rings(faces, len(body))),
+        face_edges=jax.device_put(face_edges.astype(np.int32)),
+        edge_sides=jax.device_put(sides),
+        border=jax.device_put(border),
+        cloth_blocks=jax.device_put(cloth_blocks),
+        cloth_place=jax.device_put(place),
+        vertex_blocks=jax.device_put(vertex_blocks),
+        vertex_lists=jax.device_put(_lists(posed, cloth_blocks, vertex_blocks, groups)),
+        face_blocks=jax.device_put(face_blocks),
+        face_lists=jax.device_put(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
         spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
         groups=groups,
     )
