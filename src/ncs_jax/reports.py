@@ -1,0 +1,140 @@
+"""What the command line tells of an animation and of a scene."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from pathlib import Path
+
+from ncs_jax.errors import InputError
+from ncs_jax.scene import Scene, load_scene
+
+__all__ = ["check", "evaluate", "motions_of"]
+
+
+def motions_of(scene: Scene) -> tuple[str, ...]:
+    """All of a scene's motions, those to train on first."""
+    return (*scene.motion.files, *scene.motion.validation)
+
+
+def evaluate(options) -> int:
+    """`ncs evaluate`: how an animation does and how it moves, in physical units."""
+    import numpy as np
+
+    from ncs_jax import io
+    from ncs_jax.assembly import assemble
+    from ncs_jax.dynamics import MEASURES, compare, dynamics
+    from ncs_jax.evaluation import QUANTITIES, measure, summarise
+    from ncs_jax.runs import Run, load_run
+
+    target = Path(options.target)
+    if not target.exists():
+        raise InputError("no such run folder or animation", file=target, mend="check the path")
+    rows, moving = {}, {}
+
+    def look(run, name, track, vertices):
+        model = run.assembly.model
+        rows[name], moving[name] = measure(model, vertices, track), dynamics(model, vertices, track)
+        if options.reference is None:
+            return
+        reference = io.read_animation(options.reference)
+        if reference.vertices.shape != vertices.shape:
+            raise InputError(
+                f"frames, vertices and 3 of the motion expected, {vertices.shape}", file=options.reference, field="vertices",
+                value=reference.vertices.shape, mend="give the --motion that it was made from",
+            )  # fmt: skip
+        moving[name] |= compare(model, vertices, reference.vertices, track)
+
+    if target.is_dir() and not options.scene:
+        run = load_run(target)
+        names = (options.motion,) if options.motion else tuple(dict.fromkeys(motions_of(run.assembly.scene)))
+        if options.reference is not None and len(names) > 1:
+            raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")
+        for name in names:
+            track = run.track(name)
+            look(run, name, track, run.animate(track, options.alpha))
+            if options.alpha != 0 and run.assembly.network.controlled:
+                still = dynamics(run.assembly.model, run.animate(track, 0.0), track)["speed"]
+                moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
+    else:
+        if not options.scene:
+            raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
+        animation, scene = io.read_animation(target), load_scene(options.scene)
+        assembly = assemble(scene.without_network())
+        names = (options.motion,) if options.motion else motions_of(scene)
+        if not names:
+            raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
+        run = Run(assembly, {})
+        track = run.track(names[0])
+        expected = (track.start.shape[0], *assembly.model.garment.mesh.rest.shape)
+        if animation.vertices.shape != expected:
+            raise InputError(
+                f"frames, vertices and 3 of the scene expected, {expected}", file=target, field="vertices",
+                value=animation.vertices.shape, mend="give the --motion and --scene that it was made from",
+            )  # fmt: skip
+        look(run, names[0], track, np.asarray(animation.vertices, np.float32))
+    if options.json:
+        frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}
+        print(json.dumps({n: {"mean": summarise(r) | moving[n], "frames": frames[n]} for n, r in rows.items()}))
+        return 0
+    means = {name: summarise(r) | moving[name] for name, r in rows.items()}
+    if len(means) > 1:
+        every = dict.fromkeys(k for m in means.values() for k in m)
+        means["all"] = {k: float(np.mean([m[k] for m in means.values() if k in m])) for k in every}
+    labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
+    width = max(map(len, labels)) + 2
+    for quantity in dict.fromkeys(k for m in means.values() for k in m):
+        unit, text = (QUANTITIES | MEASURES).get(quantity, ("J", "energy"))
+        print(f"{quantity} [{unit}], {text}" if unit else f"{quantity}, {text}")
+        for name, m in zip(labels, means.values(), strict=True):
+            if quantity in m:
+                print(f"  {name:{width}} {m[quantity]:.4g}")
+    return 0
+
+
+def check(options) -> int:
+    """`ncs check`: what is in a scene, and what is at risk."""
+    from ncs_jax.assembly import assemble
+    from ncs_jax.grading import findings
+    from ncs_jax.io.surface import anatomy
+    from ncs_jax.scene import template
+
+    if options.fields:
+        print(template(), end="")
+        return 0
+    if options.scene is None:
+        raise InputError("a scene file is needed", mend="give one, ncs:tshirt for the packaged one, or --fields")
+    assembly = assemble(load_scene(options.scene))
+    model, mesh = assembly.model, assembly.model.garment.mesh
+    names = assembly.body.joint_names if assembly.body is not None else ()
+    joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
+    terms = model.terms
+    on = [n for n in ("membrane", "bending", "collision", "gravity", "inertia", "pinning") if getattr(terms, n)]
+    print(f"{options.scene}: good")
+    mass = float((mesh.vertex_area * model.material.density).sum())
+    size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
+    print(f"  garment   {mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
+    record = assembly.garment
+    parts = anatomy(record.vertices, record.faces)
+    print(f"  surface   connected components {parts.components}, boundary loops (holes) {parts.loops}, ", end="")
+    print(f"degenerate triangles {parts.degenerate}")
+    kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
+    print(f"  file      {record.scale:g} m a unit, {record.up.upper()} up; {kept}")
+    if model.body is not None:
+        print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+    print(f"  joints    {', '.join(joints)}")
+    print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
+    scene = assembly.scene
+    for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
+        for name in names:
+            print(f"  {kind:9} {name}: {len(assembly.motions[name].poses)} frames at {model.fps:g} per second")
+            for note in assembly.motions[name].notes:
+                print(textwrap.fill(note, 128, initial_indent=12 * " ", subsequent_indent=14 * " "))
+    if not model.moves:
+        print("  the character never moves: only the static network is trained")
+    found = findings(assembly)
+    for finding in found:
+        print(f"  at risk   {finding.what}: {finding.value}: {finding.risk}; {finding.mend}")
+    if not found:
+        print("  safe      material, mesh, fit and motions are inside the ranges of the stability map")
+    return 0
