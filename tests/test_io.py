@@ -26,7 +26,11 @@ from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io.bvh import read_bvh
 from ncs_jax.scene import load_scene, template
+from tests import fbx_files
+from tests.characters import write_glb
 from tests.conftest import THOROUGH
+from tests.test_fbx import Hero
+from tests.test_gltf import changed
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 ASSETS = Path(io.__file__).parents[1] / "assets"
@@ -551,7 +555,7 @@ DAMAGED = {
     "not_hdf5.h5": (b"poses", "not a readable HDF5"),
     "truncated.h5": (b"\x89HDF\r\n\x1a\n" + b"\0" * 100, "not a readable HDF5"),
     "empty.h5": (b"", "an empty file"),
-    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh expected"),
+    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh, .glb, .gltf, .fbx expected"),
     "m": (b"1", "found 'no suffix'"),
     "words.bvh": (b"hello", "HIERARCHY and then MOTION"),
     "binary.bvh": (bytes(range(256)) * 4, "HIERARCHY and then MOTION"),
@@ -809,6 +813,17 @@ def hdf5_bytes(fields: dict) -> bytes:
     return out.getvalue()
 
 
+def glb_bytes() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return write_glb(Path(folder) / "hero.glb").read_bytes()
+
+
+def gltf_bytes() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_glb(Path(folder) / "hero.glb")
+        return changed(path, Path(folder) / "text.gltf", lambda tree: None).read_bytes()
+
+
 # kind: reader, suffix, and a sound file's bytes; None: an .npz of which one array is damaged
 READERS = {
     "zip": (io.read_motion, "npz", lambda: npz_bytes(motion())),
@@ -828,6 +843,12 @@ READERS = {
     "glb": (io.read_garment, "glb", lambda: meshes("glb")),
     "bvh": (io.read_motion, "bvh", lambda: BVH.encode()),
     "pc2": (io.read_animation, "pc2", lambda: PC2),
+    "glb body": (io.read_body, "glb", lambda: glb_bytes()),
+    "glb motion": (io.read_motion, "glb", lambda: glb_bytes()),
+    "gltf": (io.read_motion, "gltf", lambda: gltf_bytes()),
+    "fbx body": (io.read_body, "fbx", lambda: fbx_files.binary(Hero("Y up, cm").tree())),
+    "fbx motion": (io.read_motion, "fbx", lambda: fbx_files.binary(Hero("Z up, inches").tree())),
+    "fbx text": (io.read_motion, "fbx", lambda: fbx_files.text(Hero("Z up, inches").tree())),
     "scene": (load_scene, "toml", lambda: template().encode()),
 }
 FIELDS = {"body": body, "garment": garment, "motion": motion, "animation": animation}

@@ -1,4 +1,4 @@
-"""Skinned bodies from .npz: this package's layout, the published neural cloth simulation's, or a SMPL family model file."""
+"""Skinned bodies from .npz (this package's, the published cloth simulation's, or a SMPL family model), .glb and .fbx."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.fbx_character import fbx_body
 from ncs_jax.io.files import LARGEST
+from ncs_jax.io.gltf_character import gltf_body
 from ncs_jax.io.npz import read_npz
 from ncs_jax.io.records import BodyRecord
 from ncs_jax.io.smpl import smpl_names, smpl_parents
@@ -28,12 +30,12 @@ np.savez({new!r}, **{{k: np.array(m[k].toarray() if hasattr(m[k], 'toarray') els
 
 
 def read_body(path: str | Path) -> BodyRecord:
-    """A character in its rest pose, from .npz.
+    """A character in its rest pose, from .npz, .glb, .gltf or .fbx.
 
-    `vertices` (V, 3) and `joints` (J, 3) in m, `faces` (F, 3), `parents` (J,), and skinning weights either dense,
-    `blend_weights` (V, J), or sparse, `weight_joints` (V, K) with `weights` (V, K). `joint_names` (J,) and `rest_rotations`
-    (J, 3, 3) may be there. The root's parent is -1, or as SMPL files have it 0 or 4294967295. Rows of weights that sum to 1
-    within 1e-3 are divided by their sum.
+    Of .glb, .gltf and .fbx, see `gltf_body` and `fbx_body`. An .npz holds `vertices` (V, 3) and `joints` (J, 3) in m, `faces`
+    (F, 3), `parents` (J,), and skinning weights either dense, `blend_weights` (V, J), or sparse, `weight_joints` (V, K) with
+    `weights` (V, K). `joint_names` (J,) and `rest_rotations` (J, 3, 3) may be there. The root's parent is -1, or as SMPL files
+    have it 0 or 4294967295. Rows of weights that sum to 1 within 1e-3 are divided by their sum.
 
     A model file of SMPL, SMPL-H or SMPL-X is read as it is distributed, `v_template` (V, 3), `f` (F, 3), `weights` (V, J),
     `kintree_table` (2, J) and `J_regressor`, (J, V) or the three arrays of a sparse one with `_data`, `_indices` and `_indptr`
@@ -44,10 +46,13 @@ def read_body(path: str | Path) -> BodyRecord:
         InputError: the file cannot be read; or shapes disagree, a number is not finite or names nothing, the joints are not one
             tree with parents before children, or weights are negative or do not sum to 1.
     """
-    if Path(path).suffix.lower() in (".pkl", ".pickle"):
+    suffix = Path(path).suffix.lower()
+    if suffix in (".glb", ".gltf", ".fbx"):
+        return fbx_body(path) if suffix == ".fbx" else gltf_body(path)
+    if suffix in (".pkl", ".pickle"):
         convert = CONVERT.format(old=str(path), new=str(Path(path).with_suffix(".npz")), fields=MODEL)
         raise InputError(
-            "an .npz expected: a pickle may run any code, so none is ever loaded", file=path, value=Path(path).suffix,
+            "an .npz expected: a pickle may run any code, so none is ever loaded", file=path, value=suffix,
             mend=f"where you trust it, make one (a few of these files need `pip install chumpy` for it): {convert}",
         )  # fmt: skip
     table = read_npz(path, {*FIELDS, *MODEL, *SPARSE}.__contains__)

@@ -1,4 +1,4 @@
-"""Motions from .npz and .h5 (this package's, and AMASS's), and from .bvh."""
+"""Motions from .npz and .h5 (this package's, and AMASS's), from .bvh, and from animated characters in .glb, .gltf and .fbx."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.bvh import read_bvh
+from ncs_jax.io.fbx_character import fbx_motion
+from ncs_jax.io.gltf_character import gltf_motion
 from ncs_jax.io.hdf5 import read_hdf5
 from ncs_jax.io.npz import read_npz
 from ncs_jax.io.quaternions import to_axis_angle
 from ncs_jax.io.records import MotionRecord
+from ncs_jax.io.rig import split_clip
 from ncs_jax.io.table import Table, floats, select, tree
 
 __all__ = ["read_motion"]
@@ -20,7 +23,7 @@ __all__ = ["read_motion"]
 FPS = ("fps", "mocap_framerate", "mocap_frame_rate")
 PARTS = ("root_orient", "pose_body", "pose_jaw", "pose_eye", "pose_hand")  # of AMASS, in the order of SMPL-X's joints
 FIELDS = ("poses", "quaternions", "trans", "joint_names", "joints", "parents", *PARTS, *FPS)
-FORMATS = (".npz", ".h5", ".hdf5", ".bvh")
+FORMATS = (".npz", ".h5", ".hdf5", ".bvh", ".glb", ".gltf", ".fbx")
 
 
 class Skeleton(NamedTuple):
@@ -40,7 +43,8 @@ def read_motion(
     (T, 3); and `fps`, in AMASS `mocap_framerate` or `mocap_frame_rate`, whose world has Z up. AMASS may have its poses in
     parts: `root_orient` (T, 3), `pose_body` (T, 63), and `pose_hand` (T, 90) with or without `pose_jaw` and `pose_eye`.
     `joint_names` (J,) may be there, and the skeleton, `joints` (J, 3) with `parents` (J,). A .bvh has both; its translation is
-    the root's position less the root's OFFSET.
+    the root's position less the root's OFFSET. Of .glb, .gltf and .fbx, see `gltf_motion` and `fbx_motion`; FILE.glb#NAME names
+    one animation of several, of which the first is read otherwise.
 
     Args:
         path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end. Other frames may be
@@ -50,7 +54,8 @@ def read_motion(
         InputError: the file cannot be read; or shapes disagree, a chosen frame has a number that is not finite or a quaternion
             of length zero, there is no frame, or the frame rate is not above 0.
     """
-    suffix = Path(path).suffix.lower()
+    name, clip = split_clip(path)
+    suffix = Path(name).suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
     if not 0 < scale < 1e6:
@@ -63,6 +68,9 @@ def read_motion(
         for j, parent in enumerate(bvh.parents[1:], 1):
             joints[j] += joints[parent]
         skeleton = Skeleton(joints * scale, bvh.parents, (joints + bvh.tips) * scale)
+    elif suffix in FORMATS[4:]:
+        found = (fbx_motion if suffix == ".fbx" else gltf_motion)(name, clip)
+        file, poses, translation, fps, names = Path(name), found.poses, found.translation, found.fps, found.joint_names
     else:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
         file, poses, translation, fps = table.file, _rotations(table), table.array("trans"), table.number(*FPS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["about_axis", "multiply", "to_axis_angle"]
+__all__ = ["about_axis", "from_matrix", "multiply", "slerp", "to_axis_angle", "to_matrix"]
 
 
 def about_axis(axis: int, angle: np.ndarray) -> np.ndarray:
@@ -30,3 +30,41 @@ def to_axis_angle(q: np.ndarray) -> np.ndarray:
     small = length < 1e-12 * np.abs(q[..., :1])
     angle = 2 * np.arctan2(length, q[..., :1])
     return q[..., 1:] * np.where(small, 2 / np.where(small, q[..., :1], 1), angle / np.where(length > 0, length, 1))
+
+
+def to_matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def from_matrix(r: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4), of any length but zero, of rotation matrices (..., 3, 3); of four ways the best (Shepperd 1978)."""
+    (a, f, e), (c, b, g), (d, h, i) = np.moveaxis(r, (-2, -1), (0, 1))
+    ways = np.stack(
+        [
+            np.stack([1 + a + b + i, h - g, e - d, c - f], axis=-1),
+            np.stack([h - g, 1 + a - b - i, f + c, e + d], axis=-1),
+            np.stack([e - d, f + c, 1 - a + b - i, g + h], axis=-1),
+            np.stack([c - f, e + d, g + h, 1 - a - b + i], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.stack([a + b + i, a - b - i, b - a - i, i - a - b], axis=-1), axis=-1)
+    return np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :]
+
+
+def slerp(p: np.ndarray, q: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """From unit quaternion p to q (..., 4) along the shorter arc, by the share t (...)."""
+    q = np.where((p * q).sum(-1, keepdims=True) < 0, -q, q)
+    angle = 2 * np.arctan2(np.linalg.norm(q - p, axis=-1), np.linalg.norm(q + p, axis=-1))
+    small = angle < 1e-6
+    sine = np.sin(np.where(small, 1, angle))
+    mixed = np.where(small, 1 - t, np.sin((1 - t) * angle) / sine)[..., None] * p
+    mixed = mixed + np.where(small, t, np.sin(t * angle) / sine)[..., None] * q
+    return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
