@@ -301,6 +301,21 @@ def test_a_body_with_rest_rotations(rng):
     np.testing.assert_allclose(to_rest_axes(jnp.asarray(turns), jnp.asarray(axes)), expected, atol=1e-9)
 
 
+def test_poses_along_the_joints_own_axes_are_the_same_motion(rng):
+    """As .glb and .fbx have them: R = Q^T (rotation along the world's axes) Q."""
+    body, motion = body_of("smpl", droop=0.4), motion_of("mixamo", rng)
+    own = Rotation.random(motion.poses.shape[1], random_state=np.random.RandomState(3)).as_matrix()
+    along = replace(motion, poses=np.einsum("jba,tjb->tja", own, motion.poses), rest_rotations=own)
+    plain = retarget(motion, body).motion
+    np.testing.assert_allclose(retarget(along, body).motion.poses, plain.poses, atol=1e-9)
+    np.testing.assert_allclose(retarget(along, body).motion.translation, plain.translation, atol=1e-9)
+    # the same skeleton needs no retargeting, but its axes may be others
+    twin = body_of("mixamo")
+    np.testing.assert_allclose(cast(along, twin, MotionSpec()).poses, motion.poses, atol=1e-9)
+    turned = replace(twin, rest_rotations=own)
+    np.testing.assert_allclose(cast(along, turned, MotionSpec()).poses, along.poses, atol=1e-12)
+
+
 def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
     motion = motion_of("mixamo", rng)
     foreign = replace(motion, joint_names=tuple(f"bone {j}" for j in range(len(motion.joint_names))))

@@ -54,9 +54,14 @@ def cast(motion: MotionRecord, body: BodyRecord | None, spec: MotionSpec, world:
             f"{joints} joints expected, as the body has", field="poses", value=f"{motion.poses.shape[1]} joints",
             mend="give a motion of this skeleton",
         )  # fmt: skip
-    poses, translation = motion.poses, motion.translation
+    poses, translation, axes = motion.poses, motion.translation, motion.rest_rotations
     if names and motion.joint_names and motion.joint_names != names and set(motion.joint_names) == set(names):
-        poses = poses[:, [motion.joint_names.index(n) for n in names]]
+        order = [motion.joint_names.index(n) for n in names]
+        poses, axes = poses[:, order], None if axes is None else axes[order]
+    if axes is not None:
+        change = axes if body is None or body.rest_rotations is None else np.swapaxes(body.rest_rotations, 1, 2) @ axes
+        if np.abs(change - np.eye(3)).max() > 1e-4:  # the same joints, whose own axes are others
+            poses = np.einsum("jab,tjb->tja", change, poses)
     if spec.scale:
         translation = translation * spec.scale
         notes = (*notes, f"a unit of its path is {spec.scale:.4g} m, as the scene says")

@@ -209,6 +209,8 @@ def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.
     if turns is None:
         turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix()
         turns = turns.reshape(*motion.poses.shape, 3)
+        if motion.rest_rotations is not None:
+            turns = motion.rest_rotations @ turns @ np.swapaxes(motion.rest_rotations, 1, 2)
     places = np.zeros(motion.poses.shape)
     for j, parent in enumerate(motion.parents):
         if parent < 0:

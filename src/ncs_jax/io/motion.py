@@ -32,6 +32,7 @@ class Skeleton(NamedTuple):
     joints: np.ndarray | None
     parents: np.ndarray | None
     tips: np.ndarray | None
+    rest_rotations: np.ndarray | None = None
 
 
 def read_motion(
@@ -71,6 +72,7 @@ def read_motion(
     elif suffix in FORMATS[4:]:
         found = (fbx_motion if suffix == ".fbx" else gltf_motion)(name, clip)
         file, poses, translation, fps, names = Path(name), found.poses, found.translation, found.fps, found.joint_names
+        skeleton = Skeleton(found.joints * scale, found.parents, None, found.rest_rotations)
     else:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
         file, poses, translation, fps = table.file, _rotations(table), table.array("trans"), table.number(*FPS)

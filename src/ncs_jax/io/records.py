@@ -56,8 +56,9 @@ class MotionRecord:
         poses: (T, J, 3) local rotations since rest, axis times angle, rad. translation: (T, 3) of the root since rest, m.
         fps: frames per second. joint_names: J names, or none. joints: (J, 3) global rest positions in the unit of the
             translation, parents: (J,) int32 as of a body, and tips: (J, 3) global rest positions of the ends of the last bones,
-            NaN elsewhere, where the file has its own skeleton. up: the axis of the world that points up, where the format
-            says, else "". notes: what was done so that it drives the body.
+            NaN elsewhere, where the file has its own skeleton. rest_rotations: (J, 3, 3) the axes that poses are along, as of a
+            body; None: the world's. up: the axis of the world that points up, where the format says, else "". notes: what was
+            done so that it drives the body.
     """
 
     poses: np.ndarray
@@ -67,6 +68,7 @@ class MotionRecord:
     joints: np.ndarray | None = None
     parents: np.ndarray | None = None
     tips: np.ndarray | None = None
+    rest_rotations: np.ndarray | None = None
     up: str = ""
     notes: tuple[str, ...] = ()
 

@@ -341,7 +341,7 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
         local[:, 1:] = np.swapaxes(world[:, above], -1, -2) @ world[:, 1:]
         turned.append(to_axis_angle(from_matrix(np.swapaxes(rest, -1, -2) @ local @ rest)))
         moved.append(place[:, 0] - joints[0])
-    return MotionRecord(np.concatenate(turned), np.concatenate(moved), fps, rig.names)
+    return MotionRecord(np.concatenate(turned), np.concatenate(moved), fps, rig.names, joints, rig.parents, rest_rotations=rest)
 
 
 def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
