@@ -1,75 +1,152 @@
 """The study: every experiment, and the page that has all their tables and pictures.
 
-    python -m experiments [--steps 700] [--quick] [--out experiments] [--kept runs/study]
+    python -m experiments [--steps 700] [--quick] [--page] [--out experiments] [--kept runs/study]
 
 Writes OUT/README.md and its tables and pictures in OUT/results. What has been simulated and trained is kept in `--kept`, where
-a study that was interrupted goes on; a fresh one starts from an empty folder.
+a study that was interrupted goes on; a fresh one starts from an empty folder. `--page` writes the page anew from the tables
+that are there.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from experiments import architecture, augmentation, budget, control, descriptors, falling, membranes, methods, spread
 from experiments.study import BALANCE, KEPT, STAND, UNSEEN, keep_programs, standing, stem
 from ncs_jax import InputError, load_scene
 
-SCENE, SKIRT = "ncs:tshirt", "ncs:skirt"
+STEPS = 700
 LONG = 5  # times as many steps for the methods side by side, and for motion control
+FALLS = 10_000
 
 
-def section(title: str, module: Any, rows: Sequence[dict], out: Path, name: str, pictures: Sequence[str]) -> str:
+class Section(NamedTuple):
+    """A part of the page: an experiment's module, its garment, how many times the steps, and its pictures but for one."""
+
+    title: str
+    module: Any
+    scene: str = "ncs:tshirt"
+    times: int = 1
+    pictures: tuple[str, ...] = ()
+
+
+STRIPS = tuple(map(stem, UNSEEN))
+SECTIONS = {
+    "methods": Section(
+        "Four methods side by side: T-shirt", methods, times=LONG, pictures=tuple(f"methods_{name}" for name in STRIPS)
+    ),
+    "skirt": Section("Four methods side by side: skirt", methods, "ncs:skirt", LONG, tuple(f"skirt_{name}" for name in STRIPS)),
+    "falling": Section("Free fall and a pendulum", falling),
+    "control": Section("Motion control", control, times=LONG),
+    "spread": Section("Spread", spread),
+    "descriptors": Section("Descriptors", descriptors),
+    "architecture": Section("Architecture", architecture),
+    "augmentation": Section("Augmentation", augmentation),
+    "budget": Section("Training data and budget", budget),
+    "membranes": Section("Membranes", membranes),
+}
+# What is chosen: the table, its column, what that begins or ends with, and the table's columns of energy and distance.
+CHOICES = {
+    "network": ("architecture", "network", "", "total", "distance"),
+    "descriptor": ("descriptors", "descriptor", "", "unseen_total", "unseen_distance"),
+    "augmentation": ("augmentation", "augmentation", "", "total", "distance"),
+    "window (gated unit)": ("budget", "change", "window of", "total", "distance"),
+    "batch": ("budget", "change", "batch of", "total", "distance"),
+    "number of motions": ("budget", "change", "motions", "total", "distance"),
+}
+
+
+def number(text: str) -> float | str:
+    """As it was before it was written."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def rows_of(results: Path, name: str) -> list[dict]:
+    """An experiment's rows, as it wrote them."""
+    with (results / f"{name}.csv").open(newline="") as file:
+        return [{key: number(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+
+
+def written(results: Path, name: str) -> str:
     """An experiment's part of the page."""
-    shown = "\n\n".join(f"![{title}](results/{picture}.png)" for picture in pictures)
-    told = module.__doc__.split("\n\n")[0]
-    table = (out / f"{name}.md").read_text()
-    return f"## {title}\n\n{told} (`python -m {module.__name__}`)\n\n{module.conclusion(rows)}\n\n{table}\n{shown}\n"
+    title, module, _, _, pictures = SECTIONS[name]
+    shown = "\n\n".join(f"![{title}](results/{picture}.png)" for picture in pictures or (name,))
+    told, table = module.__doc__.split("\n\n")[0], (results / f"{name}.md").read_text()
+    text = module.conclusion(rows_of(results, name))
+    return f"## {title}\n\n{told} (`python -m {module.__name__}`)\n\n{text}\n\n{table}\n{shown}\n"
 
 
-def study(steps: int, falls: int, out: Path, kept: Path) -> str:
-    """Run every experiment and return the page."""
-    results, began = out / "results", time.monotonic()
-    scene, skirt = load_scene(SCENE), load_scene(SKIRT)
-    parts = []
+def ranked(results: Path) -> Iterator[tuple[float, str]]:
+    """Of everything that can be chosen: how far the distances of the choices are apart, mm, and a line that says so."""
+    for what, (name, column, sign, energy, distance) in CHOICES.items():
+        rows = [row for row in rows_of(results, name) if sign in str(row[column])]
+        best, worst = (choose(rows, key=lambda row: row[distance]) for choose in (min, max))
+        apart = worst[distance] - best[distance]
+        moving = [row["stopped_share"] for row in rows if "stopped_share" in row]
+        cells = [
+            what, best[column], worst[column], f"{best[distance]:.1f}", f"{worst[distance]:.1f}", f"{apart:.1f}",
+            f"{100 * (worst[energy] / best[energy] - 1):+.2f}", f"{min(moving):.2f} to {max(moving):.2f}" if moving else "",
+        ]  # fmt: skip
+        yield apart, f"| {' | '.join(map(str, cells))} |"
 
-    def add(title, module, rows, name, pictures):
-        parts.append(section(title, module, rows, results, name, pictures))
-        print(f"{(time.monotonic() - began) / 60:5.1f} min  {title}: {module.conclusion(rows)}", flush=True)
 
-    unseen = standing(scene, UNSEEN, kept)
-    strips = [*map(stem, unseen)]
-    for name, one in (("methods", scene), ("skirt", skirt)):
-        title = f"Four methods side by side: {one.garment.file.removeprefix('ncs:')}"
-        rows = methods.experiment(one, unseen, LONG * steps, results, kept, name)
-        add(title, methods, rows, name, [f"{name}_{strip}" for strip in strips])
-    add("Free fall and a pendulum", falling, falling.experiment(results, falls), "falling", ["falling"])
-    for title, module, count in (
-        ("Motion control", control, LONG * steps),
-        ("Spread", spread, steps),
-        ("Descriptors", descriptors, steps),
-        ("Architecture", architecture, steps),
-        ("Augmentation", augmentation, steps),
-        ("Training data and budget", budget, steps),
-        ("Membranes", membranes, steps),
-    ):
-        name = module.__name__.rpartition(".")[2]
-        add(title, module, module.experiment(scene, unseen, count, results, kept), name, [name])
-    minutes = (time.monotonic() - began) / 60
+def mattered(results: Path) -> str:
+    """Which choices mattered."""
+    luck = rows_of(results, "spread")[-1]
+    mm, stopped = f"{luck['distance']:.1f} mm", f"{luck['stopped_share']:.2f}"
+    found = sorted(ranked(results), reverse=True)
+    lines = "\n".join(line for _, line in found)
+    more = sum(apart > luck["distance"] for apart, _ in found)
+    return f"""## What mattered
+
+By how much the choice that is nearest to the simulation differs from the one that is farthest from it. From seed to seed it is
+{mm}; {more} of {len(found)} differ by more. What moves after a stop, as a share of what the simulation moves there, differs by
+{stopped} from seed to seed.
+
+| what is chosen | nearest | farthest | mm | mm | apart, mm | energy of the farthest, % | moves after a stop |
+|---|---|---|---|---|---|---|---|
+{lines}
+"""
+
+
+def page(results: Path) -> str:
+    """The whole page, from the tables."""
+    (facts,) = rows_of(results, "study")
+    steps = round(facts["steps"])
     head = f"""# The study
 
 Every claim of the method as an experiment on the packaged garments. All tables and pictures here are made by `make study`, in
-{minutes:.0f} minutes. Every network is trained from one seed on the scene's motions without
+{facts["minutes"]:.0f} minutes. Every network is trained from one seed on the scene's motions without
 {" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact, of
 which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps where methods stand side by side and for motion
 control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
-seed to seed says the section Spread.
+seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them.
 """
-    return "\n".join([head, *parts])
+    return "\n".join([head, mattered(results), *(written(results, name) for name in SECTIONS)])
+
+
+def study(steps: int, falls: int, results: Path, kept: Path) -> None:
+    """Run every experiment."""
+    began = time.monotonic()
+    for name, (title, module, scene, times, _) in SECTIONS.items():
+        if module is falling:
+            rows = falling.experiment(results, falls)
+        else:
+            loaded = load_scene(scene)
+            more = (name,) if module is methods else ()
+            rows = module.experiment(loaded, standing(loaded, UNSEEN, kept), times * steps, results, kept, *more)
+        print(f"{(time.monotonic() - began) / 60:5.1f} min  {title}: {module.conclusion(rows)}", flush=True)
+    with (results / "study.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["steps", "minutes"], [steps, (time.monotonic() - began) / 60]])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -77,19 +154,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="experiments", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=700, help="of training (default: 700)")
+    parser.add_argument("--steps", type=int, default=STEPS, help=f"of training (default: {STEPS})")
     parser.add_argument("--quick", action="store_true", help="20 steps, to try it out: the numbers mean nothing")
-    parser.add_argument("--out", default="experiments", help="folder for README.md and results/ (default: experiments)")
+    parser.add_argument("--page", action="store_true", help="measure nothing: the page from the tables in OUT/results")
+    parser.add_argument(
+        "--out", type=Path, default="experiments", help="folder for README.md and results/ (default: experiments)"
+    )
     parser.add_argument("--kept", type=Path, default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")
     o = parser.parse_args(arguments)
-    steps, falls = (20, 100) if o.quick else (o.steps, 10_000)
     keep_programs(o.kept)
+    results = o.out / "results"
     try:
-        page = study(steps, falls, Path(o.out), o.kept)
+        if not o.page:
+            study(20 if o.quick else o.steps, 100 if o.quick else FALLS, results, o.kept)
+        (o.out / "README.md").write_text(page(results))
     except InputError as error:
         print(f"study: {error}", file=sys.stderr)
         return 2
-    (Path(o.out) / "README.md").write_text(page)
     return 0
 
 

@@ -1,10 +1,12 @@
 """Experiments at their smallest size."""
 
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments import __main__ as whole
 from experiments import (
     architecture,
     augmentation,
@@ -93,18 +95,15 @@ def studied(module, tmp_path, *more, text=SCENE):
     with (out / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert (out / f"{name}.md").read_text().count("\n") == 2 + len(rows)
-    told = module.conclusion([{k: number(v) for k, v in row.items() if v} for row in rows])
+    told = module.conclusion([{k: whole.number(v) for k, v in row.items() if v} for row in rows])
     assert told.endswith(".") and "nan" not in told
     assert module.main([str(tmp_path / "nowhere.toml")]) == 2
     return {next(iter(row.values())): row for row in rows}
 
 
-def number(text):
-    """As it was before it was written."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
+def test_the_page_is_what_its_tables_say():
+    folder = Path(study.__file__).parent
+    assert whole.page(folder / "results") == (folder / "README.md").read_text()
 
 
 def test_methods(alone, tmp_path):
