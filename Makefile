@@ -29,7 +29,7 @@ bench: .venv/installed
 	mkdir -p runs/bench
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name $(SCENE) --json runs/bench/$$name.json || exit; done
 
-# Every experiment, and the page of them all, experiments/README.md. About an hour and a quarter.
+# Every experiment, and the page of them all, experiments/README.md. About an hour and a half.
 study: .venv/installed
 	rm -rf runs/study
 	$(BIN)/python -m experiments
