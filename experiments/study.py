@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -238,11 +239,11 @@ def bars(path: Path, rows: Sequence[dict], key: str, columns: dict[str, str]) ->
         for place, (axes, (name, heading)) in enumerate(zip(every, columns.items(), strict=True)):
             axes.barh([row[key] for row in rows], [row.get(name, 0) for row in rows], color="C0", height=0.6)
             values = [row[name] for row in rows if name in row]
-            if name == "total":  # what sets energies apart is little of them
+            if name.endswith("total"):  # what sets energies apart is little of them
                 axes.set_xlim(min(values) - 0.5 * np.ptp(values), max(values) + 0.1 * np.ptp(values))
             axes.invert_yaxis()
             axes.locator_params(axis="x", nbins=4)
-            axes.set_xlabel(heading)
+            axes.set_xlabel(textwrap.fill(heading, 36))
             if place:
                 axes.set_yticklabels([])
 
