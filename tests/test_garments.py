@@ -171,10 +171,10 @@ def test_usd_in_centimetres_and_z_up_under_a_transform(tmp_path, suffix):
 
     inner = tmp_path / "inner.usdc" if suffix == "usdz" else tmp_path / f"g.{suffix}"
     stage = stage_of(inner, 0.01, "Z")
-    root = UsdGeom.Xform.Define(stage, "/root")
+    root = UsdGeom.Xform.Define(stage, "/worn")
     root.AddTranslateOp().Set(Gf.Vec3d(10, 20, 30))
     root.AddRotateZOp().Set(90)
-    add(stage, "/root/cloth", 100 * SQUARE, [[0, 1, 2, 3]])  # its subdivision scheme is Catmull-Clark, as no other is said
+    add(stage, "/worn/cloth", 100 * SQUARE, [[0, 1, 2, 3]])  # its subdivision scheme is Catmull-Clark, as no other is said
     stage.GetRootLayer().Save()
     if suffix == "usdz":
         assert UsdUtils.CreateNewUsdzPackage(str(inner), str(tmp_path / "g.usdz"))

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax import io
 from ncs_jax.assembly import assemble
 from ncs_jax.dynamics import unposed
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
@@ -23,6 +22,7 @@ from ncs_jax.kinematics import blend, skin
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
 from ncs_jax.preview import posed_body
+from ncs_jax.reports import animation_over
 from ncs_jax.runs import Run, load_run
 from ncs_jax.scene import load_scene
 
@@ -82,7 +82,7 @@ def shown(target: str, scene: str | None = None, motion: str | None = None) -> S
             return np.asarray(track.absolute(_carried(run.assembly.model, track.matrices)))
 
         return Shown(run, motions, carried, False, target)
-    vertices = _read(run, target, motions[0])
+    vertices = animation_over(target, run.assembly.model, run.track(motions[0]))
     return Shown(run, motions[:1], lambda name, alpha: vertices, False, path.name)
 
 
@@ -91,18 +91,6 @@ def _named(motion: str | None, spec) -> tuple[str, ...]:
     if not names:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
     return names
-
-
-def _read(run: Run, file: str, motion: str) -> np.ndarray:
-    """An animation of the run's garment over a motion."""
-    vertices = np.asarray(io.read_animation(file).vertices, np.float32)
-    expected = (run.track(motion).start.shape[0], *run.assembly.model.garment.mesh.rest.shape)
-    if vertices.shape != expected:
-        raise InputError(
-            f"frames, vertices and 3 of the motion expected, {expected}", file=file, field="vertices", value=vertices.shape,
-            mend="give the --motion and --scene that it was made from",
-        )  # fmt: skip
-    return vertices
 
 
 @jax.jit
@@ -307,7 +295,9 @@ def view(
     what = shown(target, scene, motion)
     first = what.motions[0]
     others = {
-        Path(name).name: load_run(name).animate(first) if Path(name).is_dir() else _read(what.run, name, first)
+        Path(name).name: load_run(name).animate(first)
+        if Path(name).is_dir()
+        else animation_over(name, what.run.assembly.model, what.run.track(first))
         for name in overlays
     }
     return View(what, others, **where)

@@ -5,11 +5,19 @@ from __future__ import annotations
 import json
 import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.scene import Scene, load_scene
 
-__all__ = ["check", "evaluate", "motions_of"]
+if TYPE_CHECKING:
+    from ncs_jax.model import Model
+    from ncs_jax.motion import Track
+
+__all__ = ["animation_over", "check", "evaluate", "motions_of"]
 
 
 def motions_of(scene: Scene) -> tuple[str, ...]:
@@ -17,11 +25,24 @@ def motions_of(scene: Scene) -> tuple[str, ...]:
     return (*scene.motion.files, *scene.motion.validation)
 
 
+def animation_over(file: str | Path, model: Model, track: Track) -> np.ndarray:
+    """An animation of the model's garment over a motion from a file, (frames, verts, 3) float32 in m.
+
+    Raises:
+        InputError: it has other frames or vertices.
+    """
+    vertices = np.asarray(io.read_animation(file).vertices, np.float32)
+    expected = (track.start.shape[0], *model.garment.mesh.rest.shape)
+    if vertices.shape != expected:
+        raise InputError(
+            f"frames, vertices and 3 of the motion expected, {expected}", file=file, field="vertices", value=vertices.shape,
+            mend="give the --motion and --scene that it was made from",
+        )  # fmt: skip
+    return vertices
+
+
 def evaluate(options) -> int:
     """`ncs evaluate`: how an animation does and how it moves, in physical units."""
-    import numpy as np
-
-    from ncs_jax import io
     from ncs_jax.assembly import assemble
     from ncs_jax.dynamics import MEASURES, compare, dynamics
     from ncs_jax.evaluation import QUANTITIES, measure, summarise
@@ -37,13 +58,8 @@ def evaluate(options) -> int:
         rows[name], moving[name] = measure(model, vertices, track), dynamics(model, vertices, track)
         if options.reference is None:
             return
-        reference = io.read_animation(options.reference)
-        if reference.vertices.shape != vertices.shape:
-            raise InputError(
-                f"frames, vertices and 3 of the motion expected, {vertices.shape}", file=options.reference, field="vertices",
-                value=reference.vertices.shape, mend="give the --motion that it was made from",
-            )  # fmt: skip
-        moving[name] |= compare(model, vertices, reference.vertices, track)
+        reference = animation_over(options.reference, model, track)
+        moving[name] |= compare(model, vertices, reference, track)
 
     if target.is_dir() and not options.scene:
         run = load_run(target)
@@ -59,20 +75,13 @@ def evaluate(options) -> int:
     else:
         if not options.scene:
             raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
-        animation, scene = io.read_animation(target), load_scene(options.scene)
-        assembly = assemble(scene.without_network())
+        scene = load_scene(options.scene)
         names = (options.motion,) if options.motion else motions_of(scene)
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
-        run = Run(assembly, {})
+        run = Run(assemble(scene.without_network()), {})
         track = run.track(names[0])
-        expected = (track.start.shape[0], *assembly.model.garment.mesh.rest.shape)
-        if animation.vertices.shape != expected:
-            raise InputError(
-                f"frames, vertices and 3 of the scene expected, {expected}", file=target, field="vertices",
-                value=animation.vertices.shape, mend="give the --motion and --scene that it was made from",
-            )  # fmt: skip
-        look(run, names[0], track, np.asarray(animation.vertices, np.float32))
+        look(run, names[0], track, animation_over(target, run.assembly.model, track))
     if options.json:
         frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}
         print(json.dumps({n: {"mean": summarise(r) | moving[n], "frames": frames[n]} for n, r in rows.items()}))
