@@ -11,10 +11,10 @@ import pytest
 from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
-from ncs_jax.fit import check_worn
 from ncs_jax.io.axes import upright
 from ncs_jax.io.polygons import triangulate
 from ncs_jax.io.surface import anatomy
+from ncs_jax.worn import check_worn
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube

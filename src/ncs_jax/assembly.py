@@ -13,7 +13,6 @@ from ncs_jax.casting import cast
 from ncs_jax.energies.collision import Surface, surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
-from ncs_jax.fit import check_worn
 from ncs_jax.kinematics import Skeleton, blend, blend_from, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
@@ -37,6 +36,7 @@ from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncod
 from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
 from ncs_jax.rotations import axis_angle_to_matrix, resample
 from ncs_jax.scene import Scene
+from ncs_jax.worn import check_worn
 
 __all__ = ["Assembly", "Prepared", "assemble", "load_motion", "mirror_partners", "track_of"]
 
@@ -127,7 +127,13 @@ def _check_fit(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> 
             "a body in metres expected, 0.3 to 5 m tall", file=scene.path(scene.body.file), field="vertices",
             value=f"{tall:.3g} m", mend="scale it to metres",
         )  # fmt: skip
-    check_worn(scene.path(scene.garment.file), garment, body.vertices, told=bool(scene.garment.up))
+    file = scene.path(scene.garment.file)
+    if garment.weights is not None and garment.weights.shape[1] != len(body.parents):
+        raise InputError(
+            f"a weight for each of the body's {len(body.parents)} joints expected", file=file, field="blend_weights",
+            value=garment.weights.shape, mend="fit the garment to this body again: ncs fit",
+        )  # fmt: skip
+    check_worn(file, garment, body.vertices, told=bool(scene.garment.up))
 
 
 def _inputs(scene: Scene, body: io.BodyRecord, wanted: tuple[int, ...]) -> tuple[int, ...]:
@@ -194,8 +200,10 @@ def _prepare(scene, body, garment, mesh, pins, records) -> Prepared:
     if body is None:
         weights = np.ones((len(garment.vertices), 1), np.float32)
         return Prepared(np.zeros(1, np.int64), np.asarray(moves), weights, np.zeros(0, np.int64), basis)
-    weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
-    weights = smooth_weights(weights, np.asarray(mesh.edges), scene.garment.smoothing)
+    weights = garment.weights
+    if weights is None:
+        weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+        weights = smooth_weights(weights, np.asarray(mesh.edges), scene.garment.smoothing)
     part = np.zeros(0, np.int64)
     if scene.physics.collision.stiffness > 0:
         part = _part(scene, body, garment, weights, records)

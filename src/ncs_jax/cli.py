@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, animate, export, simulate, evaluate, view, check."""
+"""The command line: ncs demo, train, animate, export, simulate, evaluate, view, fit, check."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs view RUN|FILE|SCENE           look at it in a browser: play, scrub, orbit, alpha, colours
+  ncs fit GARMENT --out FILE        bring a garment onto a body: units, axes, place, out of the skin, pins, weights
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
 """
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
@@ -117,8 +118,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--json", action="store_true", help="print JSON, with every frame")
 
-    check = command("check", reports.check, "read and assemble a scene without training it")
-    check.add_argument("scene", metavar="SCENE", nargs="?", help="scene file (TOML), or ncs:NAME")
+    fit = command("fit", reports.fit, "bring a garment onto a body, and write it as a file to train with, and a picture")
+    fit.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .usd*")
+    fit.add_argument("--body", default="ncs:body", metavar="FILE", help="body file (default: ncs:body, the packaged one)")
+    fit.add_argument("--out", required=True, metavar="FILE", help=".npz; the picture goes beside it, as .png")
+    fit.add_argument("--scale", type=_positive, default=0.0, help="metres a unit of the file (default: found out)")
+    fit.add_argument("--up", choices=("x", "y", "z"), default="", help="the axis that is up in the file (default: found out)")
+    fit.add_argument("--weld", type=_positive, default=0.0, metavar="M", help="make vertices within M metres one")
+    fit.add_argument(
+        "--clearance", type=_positive, default=0.004, metavar="M", help="keep vertices M metres off the body (default: 0.004)"
+    )
     look = command(
         "view", _view, "look at a run, an animation or a scene in a browser page: play, scrub, orbit, alpha, colours"
     )
@@ -129,6 +138,8 @@ def _parser() -> argparse.ArgumentParser:
     look.add_argument("--host", default="127.0.0.1", help="address to serve on (default: 127.0.0.1, this machine alone)")
     look.add_argument("--port", type=_whole, default=8080, help="default: 8080")
 
+    check = command("check", reports.check, "read and assemble a scene without training it")
+    check.add_argument("scene", metavar="SCENE", nargs="?", help="scene file (TOML), or ncs:NAME")
     check.add_argument("--fields", action="store_true", help="print a scene file with every field, its default and its range")
     return parser
 

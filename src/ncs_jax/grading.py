@@ -150,7 +150,7 @@ def findings(a: Assembly) -> list[Finding]:
     found = [*_material(a.scene), *_mesh(a)]
     if a.model.surface is not None:
         joints = 1 if a.body is None else len(a.body.parents)
-        found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out before training")
+        found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out: ncs fit")
     for name in a.motions:
         found += _motion(a, name)
     return found

@@ -173,13 +173,14 @@ def contact_sheet(
     frames: int = 8,
     up: Sequence[float] = (0.0, 1.0, 0.0),
     tile: int = 520,
+    labels: Sequence[str] = (),
 ) -> None:
     """Write a PNG of several moments of an animation, from the character's front and side; the camera turns with it.
 
     Args:
         path: of the PNG. garment: vertices (T, V, 3) in m. garment_faces: (F, 3). body: vertices (T, B, 3) in m, or None.
         body_faces: its faces, or None. fps: frames per second. frames: how many moments, evenly spread. up: the world's up.
-        tile: height of one picture in pixels.
+        tile: height of one picture in pixels. labels: of the moments; without them the time of each.
     """
     stage = _stage(garment, garment_faces, body, body_faces, fps, up)
     chosen = np.unique(np.linspace(0, len(stage.garment) - 1, max(1, frames)).round().astype(int)).tolist()
@@ -205,7 +206,8 @@ def contact_sheet(
         sheet.paste(FAINT, (8, top), text.rotate(90, expand=True))
     for column, frame in enumerate(chosen):
         x = margin + (column + 0.5) * width
-        draw.text((x, label + 2 * tile + 22), f"{frame / fps:.2f} s", INK, _font(22), "mm")
+        below = labels[column] if labels else f"{frame / fps:.2f} s"
+        draw.text((x, label + 2 * tile + 22), below, INK, _font(22), "mm")
     sheet.save(path, optimize=True)
 
 

@@ -1,4 +1,4 @@
-"""What the command line tells of an animation and of a scene."""
+"""What the command line tells of an animation, of a scene and of a garment on a body."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ncs_jax.model import Model
     from ncs_jax.motion import Track
 
-__all__ = ["animation_over", "check", "evaluate", "motions_of"]
+__all__ = ["animation_over", "check", "evaluate", "fit", "motions_of"]
 
 
 def motions_of(scene: Scene) -> tuple[str, ...]:
@@ -146,4 +146,51 @@ def check(options) -> int:
         print(f"  at risk   {finding.what}: {finding.value}: {finding.risk}; {finding.mend}")
     if not found:
         print("  safe      material, mesh, fit and motions are inside the ranges of the stability map")
+    return 0
+
+
+def fit(options) -> int:
+    """`ncs fit`: a garment on a body, written with a picture, and what was done to it."""
+    from ncs_jax.fit import PINS
+    from ncs_jax.fit import fit as fitted
+    from ncs_jax.io.surface import anatomy, boundary_loops
+    from ncs_jax.pictures import contact_sheet
+
+    out, scene = Path(options.out), Scene()
+    if out.suffix.lower() != ".npz":
+        raise InputError("a name that ends in .npz expected", field="--out", value=options.out, mend="it also holds weights")
+    body = io.read_body(scene.path(options.body))
+    given = io.read_garment(scene.path(options.garment), scale=options.scale, up=options.up, weld=options.weld)
+    asked = {name: value for name, value in (("scale", options.scale), ("up", options.up)) if value}
+    found = fitted(options.garment, given, body, clearance=options.clearance, **asked)
+    g, (before, after) = found.garment, found.depth
+    x, parts = g.vertices, anatomy(g.vertices, g.faces)
+    way = ", ".join(f"{v:.3f}" for v in found.moved)
+    pushed = 1000 * np.linalg.norm(x - found.before, axis=1)
+    print(f"{options.garment} on {options.body}: {len(x)} vertices, {len(g.faces)} triangles")
+    print(
+        f"  placed    {g.scale:g} m a unit, {g.up.upper()} up; "
+        + (f"moved by ({way}) m" if found.moved.any() else "where it is")
+    )
+    print(f"  body      {(before > 0).sum()} vertices were inside, up to {1000 * max(before.max(), 0):.1f} mm; ", end="")
+    print(f"{(pushed > 0.01).sum()} moved, by {pushed.max():.1f} mm at most; {(after > 0).sum()} inside now")
+    print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
+    print(f"  surface   connected components {parts.components}, degenerate triangles {parts.degenerate}")
+    for loop in sorted(boundary_loops(g.faces), key=lambda loop: -x[loop, 1].mean()):
+        long = np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()
+        print(f"  hole      {len(loop)} edges, {100 * long:.0f} cm around, at a height of {x[loop, 1].mean():.2f} m")
+    if PINS in given.groups:
+        print(f"  pins      {len(g.groups[PINS])} vertices, its own")
+    elif PINS in g.groups:
+        print(f"  pins      {len(g.groups[PINS])} vertices around its highest hole: nothing else carries it")
+    else:
+        print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on what faces up")
+    spread = f"of the body where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread from there"
+    print("  weights   " + ("its own" if given.weights is not None else spread))
+    io.write_garment(out, g)
+    picture, sides = out.with_suffix(".png"), np.repeat(body.vertices[None], 2, axis=0)
+    labels = ("placed", "out of the body")
+    contact_sheet(picture, np.stack([found.before, x]), g.faces, sides, body.faces, 1.0, frames=2, labels=labels)
+    print(f"wrote {out} and {picture}. In the scene file:\n\n[body]\nfile = {json.dumps(options.body)}\n")
+    print(f"[garment]\nfile = {json.dumps(out.name)}" + (f'\npins = "{PINS}"' if PINS in g.groups else ""))
     return 0

@@ -2,7 +2,7 @@
 
 from ncs_jax.io.animation import read_animation, write_animation
 from ncs_jax.io.body import read_body
-from ncs_jax.io.garment import read_garment
+from ncs_jax.io.garment import read_garment, write_garment
 from ncs_jax.io.motion import read_motion
 from ncs_jax.io.records import AnimationRecord, BodyRecord, GarmentRecord, MotionRecord
 
@@ -16,4 +16,5 @@ __all__ = [
     "read_garment",
     "read_motion",
     "write_animation",
+    "write_garment",
 ]

@@ -13,7 +13,7 @@ from ncs_jax.io.gltf_character import gltf_body
 from ncs_jax.io.npz import read_npz
 from ncs_jax.io.records import BodyRecord
 from ncs_jax.io.smpl import smpl_names, smpl_parents
-from ncs_jax.io.table import Table, indices, tree
+from ncs_jax.io.table import Table, indices, shares, tree
 
 __all__ = ["read_body"]
 
@@ -135,22 +135,7 @@ def _weights(table: Table, vertices: int, joints: int) -> np.ndarray:
             )
         weights = np.zeros((vertices, joints), sparse.dtype)
         np.add.at(weights, (np.arange(vertices)[:, None], owner), sparse)
-    low, sums = weights.min(axis=1), weights.sum(axis=1, dtype=np.float64)
-    for bad, text, value in (
-        (low < -1e-6, "weights of 0 and above expected", low),
-        (np.abs(sums - 1) > 1e-3, "weights that sum to 1 expected", sums),
-    ):
-        if bad.any():
-            v = int(bad.argmax())
-            raise InputError(
-                text,
-                file=table.file,
-                field=f"{field}, vertex {v}",
-                value=float(value[v]),
-                mend="normalise the skinning weights",
-            )
-    weights = np.maximum(weights, 0)
-    return weights / weights.sum(axis=1, keepdims=True)
+    return shares(table.file, field, weights)
 
 
 def _rest_rotations(table: Table, joints: int) -> np.ndarray | None:

@@ -8,19 +8,20 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.axes import upright
-from ncs_jax.io.npz import read_npz
+from ncs_jax.io.npz import read_npz, write_npz
 from ncs_jax.io.obj import read_obj
 from ncs_jax.io.ply import read_ply
 from ncs_jax.io.polygon_files import read_polygons
 from ncs_jax.io.records import GarmentRecord
 from ncs_jax.io.surface import check_surface
-from ncs_jax.io.table import floats, indices
+from ncs_jax.io.table import floats, indices, shares
 from ncs_jax.io.usd import USD, read_usd_mesh
 from ncs_jax.io.weld import weld as same_places
 
-__all__ = ["read_garment"]
+__all__ = ["read_garment", "write_garment"]
 
 GROUP = "group_"
+WEIGHTS = "blend_weights"
 FORMATS = (".npz", ".obj", ".ply", ".stl", ".glb", *USD)
 SPLITTING = (".stl", ".glb")  # a vertex once for each triangle, or for each texture coordinate and normal: it would come apart
 
@@ -28,9 +29,10 @@ SPLITTING = (".stl", ".glb")  # a vertex once for each triangle, or for each tex
 def read_garment(path: str | Path, *, scale: float = 0.0, up: str = "", weld: float = 0.0) -> GarmentRecord:
     """A garment in its rest shape on the resting body, in metres and Y up.
 
-    .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2) and vertex sets `group_NAME`. The vertices of
-    every format but two keep the file's order and number; in .stl and .glb, which store a vertex many times, those at exactly
-    one place become one, in order of first appearance. Polygons become triangles that do not fold, see `triangulate`.
+    .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2), vertex sets `group_NAME` and skinning weights
+    `blend_weights` (V, J) of the body's joints. The vertices of every format but two keep the file's order and number; in .stl
+    and .glb, which store a vertex many times, those at exactly one place become one, in order of first appearance. Polygons
+    become triangles that do not fold, see `triangulate`.
 
     Args:
         path: the file. scale: metres a unit of the file; 0: as the file says, else 1 (USD says it, .glb is in metres).
@@ -44,11 +46,11 @@ def read_garment(path: str | Path, *, scale: float = 0.0, up: str = "", weld: fl
     """
     suffix = Path(path).suffix.lower()
     groups: dict[str, np.ndarray] = {}
-    uv, unit, axis = None, 1.0, "y"
+    uv, weights, unit, axis = None, None, 1.0, "y"
     if suffix == ".npz":
-        table = read_npz(path, lambda n: n in ("vertices", "faces", "uv") or n.startswith(GROUP))
+        table = read_npz(path, lambda n: n in ("vertices", "faces", "uv", WEIGHTS) or n.startswith(GROUP))
         file, x, faces = table.file, table.array("vertices"), table.array("faces")
-        uv = table.arrays.get("uv")
+        uv, weights = table.arrays.get("uv"), table.arrays.get(WEIGHTS)
         groups = {n.removeprefix(GROUP): a for n, a in table.arrays.items() if n.startswith(GROUP)}
     elif suffix == ".obj":
         file, x, faces, uv = read_obj(path)
@@ -78,5 +80,16 @@ def read_garment(path: str | Path, *, scale: float = 0.0, up: str = "", weld: fl
     uv = None if uv is None else floats(file, "uv", uv, (verts, 2), ("vertex",))
     if uv is not None:
         uv = uv[kept] if np.array_equal(uv[kept][number], uv) else None
+    if weights is not None:
+        weights = shares(file, WEIGHTS, floats(file, WEIGHTS, weights, (verts, "J"), ("vertex", "joint")))[kept]
     sets = {n: number[indices(file, GROUP + n, a, ("N",), verts, "vertices")] for n, a in groups.items()}
-    return GarmentRecord(x, faces, uv, {n: np.unique(a).astype(np.int32) for n, a in sets.items()}, unit, axis, verts - len(x))
+    sets = {n: np.unique(a).astype(np.int32) for n, a in sets.items()}
+    return GarmentRecord(x, faces, uv, sets, unit, axis, verts - len(x), weights)
+
+
+def write_garment(path: str | Path, garment: GarmentRecord) -> None:
+    """Write all that a record holds as .npz; the file appears whole or not at all."""
+    more = {"uv": garment.uv, WEIGHTS: garment.weights}
+    groups = {GROUP + name: vertices for name, vertices in garment.groups.items()}
+    arrays = {name: a for name, a in more.items() if a is not None}
+    write_npz(path, vertices=garment.vertices, faces=garment.faces, **arrays, **groups)

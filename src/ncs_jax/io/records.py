@@ -37,6 +37,7 @@ class GarmentRecord:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
             or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: metres a unit of the file and the
             axis that is up in it, which were applied. welded: how many of the file's vertices became one with another.
+            weights: (V, J) skinning weights of the body's joints, not negative, every row of which sums to 1; None: the body's.
     """
 
     vertices: np.ndarray
@@ -46,6 +47,7 @@ class GarmentRecord:
     scale: float = 1.0
     up: str = "y"
     welded: int = 0
+    weights: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

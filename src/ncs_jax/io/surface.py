@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["Anatomy", "anatomy", "check_surface"]
+__all__ = ["Anatomy", "anatomy", "boundary_loops", "check_surface"]
 
 FLAT = 1e-6  # height of a triangle, of its longest edge, below which it is degenerate: float32 cannot tell it from a line
 
@@ -33,23 +33,25 @@ def anatomy(x: np.ndarray, faces: np.ndarray) -> Anatomy:
     a, b, c = (x[faces[:, k]].astype(np.float64) for k in range(3))
     longest = np.max([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
     double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return Anatomy(int(connected_components(graph, directed=False)[0]), _loops(half), int((double <= FLAT * longest).sum()))
+    components = int(connected_components(graph, directed=False)[0])
+    return Anatomy(components, len(boundary_loops(faces)), int((double <= FLAT * longest).sum()))
 
 
-def _loops(half: np.ndarray) -> int:
-    """How many loops the edges (2 vertices) of one face alone form, where the next one is found around a vertex."""
-    edges = [tuple(e) for e in half.tolist()]
+def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """The loops of a surface's boundary, its holes: the vertices of each, in turn; the next edge is found around a vertex."""
+    edges = [tuple(e) for e in faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()]
     after = {e: edges[i + 1 - 3 * (i % 3 == 2)] for i, e in enumerate(edges)}  # the next edge in its triangle
-    border = {e for e in edges if e[::-1] not in after}
-    loops = 0
+    border = dict.fromkeys(e for e in edges if e[::-1] not in after)
+    loops = []
     while border:
-        loops += 1
-        edge = next(iter(border))
+        edge, loop = next(iter(border)), []
         while edge in border:
-            border.remove(edge)
+            del border[edge]
+            loop.append(edge[0])
             edge = after[edge]
             while edge[::-1] in after:
                 edge = after[edge[::-1]]
+        loops.append(np.array(loop))
     return loops
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["Table", "floats", "indices", "select", "tree"]
+__all__ = ["Table", "floats", "indices", "select", "shares", "tree"]
 
 Shape = tuple[int | str, ...]
 
@@ -75,6 +75,22 @@ def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int,
             value=int(array[tuple(where)]), mend="counting starts at 0; write only those that exist",
         )  # fmt: skip
     return array.astype(np.int32)
+
+
+def shares(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
+    """Skinning weights (V, J) divided by their sums, which are 1 within 1e-3; none is negative."""
+    low, sums = weights.min(axis=1, initial=0), weights.sum(axis=1, dtype=np.float64)
+    for bad, text, value in (
+        (low < -1e-6, "weights of 0 and above expected", low),
+        (np.abs(sums - 1) > 1e-3, "weights that sum to 1 expected", sums),
+    ):
+        if bad.any():
+            v = int(bad.argmax())
+            raise InputError(
+                text, file=file, field=f"{field}, vertex {v}", value=float(value[v]), mend="normalise the skinning weights"
+            )
+    weights = np.maximum(weights, 0)
+    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def tree(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[str, ...] = ()) -> np.ndarray:
