@@ -63,11 +63,11 @@ def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -
     from PIL import Image, ImageDraw
 
     from ncs_jax.pictures import INK, PAPER, contact_sheet
-    from ncs_jax.preview import posed_body
+    from ncs_jax.preview import worn_over
 
     a = run.assembly
-    body, faces = (None, None) if a.body is None else (posed_body(a.body, run.motion(motion)), a.body.faces)
-    end = max((first + round(a.model.fps) for first, _ in stops(run.track(motion), a.model.fps)), default=None)
+    body, faces = worn_over(a, run.motion(motion))
+    end = max((first + round(a.model.fps) for first, _ in stops(run.track(motion), a.model)), default=None)
     body = None if body is None else body[:end]
     sheets = []
     with tempfile.TemporaryDirectory() as folder:

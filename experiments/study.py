@@ -166,8 +166,9 @@ def networks(scenes: dict[str, Scene], motions: Sequence[str], steps: int, kept:
 
 
 def keep_programs(kept: Path) -> None:
-    """What one process (`apart`) compiles, the later ones read from the folder."""
+    """What one process (`apart`) compiles, the later ones read from the folder; and each runs as the command does."""
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(kept.resolve() / "programs"))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `ncs simulate` does
 
 
 def apart(job: Callable, *arguments: Any) -> Any:

@@ -46,9 +46,9 @@ def test_the_body_is_looked_from(tmp_path):
 
 def test_where_the_character_stops(tmp_path):
     model, track = walked(tmp_path)
-    assert list(stops(track, FPS)) == [(31, 91)]
+    assert list(stops(track, model)) == [(31, 91)]
     _, short = walked(tmp_path, still=10)
-    assert list(stops(short, FPS)) == []
+    assert list(stops(short, model)) == []
     assert "settling" not in dynamics(model, moved(model, short, np.zeros((41, 3))), short)
 
 

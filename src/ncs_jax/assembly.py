@@ -7,12 +7,15 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ncs_jax import io
 from ncs_jax.casting import cast
 from ncs_jax.energies.collision import Surface, surface_from
 from ncs_jax.energies.proximity import groups_from
 from ncs_jax.errors import InputError
+from ncs_jax.io.normals import vertex_normals
+from ncs_jax.io.surface import boundary_loops
 from ncs_jax.kinematics import Skeleton, blend, blend_from, skin
 from ncs_jax.mesh import mesh_from
 from ncs_jax.methods.ncs import NCS
@@ -21,6 +24,7 @@ from ncs_jax.methods.shared import Method
 from ncs_jax.methods.snug import SNUG
 from ncs_jax.methods.swing import Swing
 from ncs_jax.model import (
+    Layer,
     Model,
     Vibrations,
     local_rotations,
@@ -34,6 +38,7 @@ from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track, mirror, track
 from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder, SwingEncoder
 from ncs_jax.objective import MEMBRANES, Garment, Material, Terms
+from ncs_jax.rollout import animated
 from ncs_jax.rotations import axis_angle_to_matrix, resample
 from ncs_jax.scene import Scene
 from ncs_jax.worn import check_worn
@@ -41,6 +46,8 @@ from ncs_jax.worn import check_worn
 __all__ = ["Assembly", "Prepared", "assemble", "load_motion", "mirror_partners", "track_of"]
 
 CELL = 8.0  # m
+COVER = 0.06  # m from the skin within which a garment below covers it,
+RIM = 0.1  # m from its rim at least
 
 
 @dataclass(frozen=True)
@@ -168,18 +175,18 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
     garment = io.read_garment(scene.path(worn.file), scale=worn.scale, up=worn.up, weld=worn.weld)
     if body is not None:
         _check_fit(scene, garment, body)
-    pins = _pins(scene, garment)
+    pins, under = _pins(scene, garment), _layers(scene, body, dtype)
     mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
     motions, track = {}, None
     if prepared is None:
         motions = {name: load_motion(scene, name, body) for name in (*scene.motion.files, *scene.motion.validation)}
-        prepared = _prepare(scene, body, garment, mesh, pins, [motions[name] for name in scene.motion.files])
-        model = _model(scene, prepared, body, garment, mesh, pins, dtype)
+        prepared = _prepare(scene, body, garment, mesh, pins, under, [motions[name] for name in scene.motion.files])
+        model = _model(scene, prepared, body, garment, mesh, pins, under, dtype)
         track = _training_track(scene, model, body, [motions[name] for name in scene.motion.files])
     else:
-        model = _model(scene, prepared, body, garment, mesh, pins, dtype)
+        model = _model(scene, prepared, body, garment, mesh, pins, under, dtype)
     smooth = scene.physics.collision.distance == "smooth"
-    faces = None if model.body is None else _submesh(body.faces, prepared.part, len(body.vertices))
+    faces = None if model.body is None else _touchable_faces(model, body, prepared.part)
     if faces is not None:
         model = replace(model, surface=_surface(model, faces, track, smooth))
     spec = scene.network
@@ -191,7 +198,64 @@ def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float3
     return Assembly(scene, prepared, model, _network(scene, model), body, garment, track, motions)
 
 
-def _prepare(scene, body, garment, mesh, pins, records) -> Prepared:
+def _layers(scene: Scene, body: io.BodyRecord | None, dtype) -> tuple[Layer, ...]:
+    """The garments worn below, from their run folders."""
+    found = []
+    for i, name in enumerate(scene.garment.over):
+        from ncs_jax.runs import load_run
+
+        run, field = load_run(scene.path(name)), f"garment.over[{i}]"
+        worn, model = run.assembly.body, run.assembly.model
+        if body is None or worn is None or not np.array_equal(worn.vertices, body.vertices):
+            raise InputError(
+                "a garment on the same body expected", file=scene.source, field=field, value=name,
+                mend="train it on the body that [body] names",
+            )  # fmt: skip
+        if model.fps != scene.motion.fps:
+            raise InputError(
+                f"a garment trained at {scene.motion.fps:g} frames per second expected", file=scene.source, field=field,
+                value=model.fps, mend="give both scenes the same motion.fps",
+            )  # fmt: skip
+        alone = replace(model, body=None, body_blend=None, surface=None, under=())
+        layer = Layer(alone, run.params, model.garment.mesh.rest, run.assembly.network)
+        found.append(jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, layer))
+    return tuple(found)
+
+
+def _touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.ndarray:
+    """Triangles of the part of the body and of the garments below, which face outward as the body does."""
+    from scipy.spatial import cKDTree
+
+    faces, count = [_submesh(body.faces, part, len(body.vertices))], len(part)
+    for layer in model.under:
+        own, rest = np.asarray(layer.model.garment.mesh.faces), np.asarray(layer.rest)
+        _, near = cKDTree(body.vertices).query(rest)
+        outward = np.sum(vertex_normals(rest, own) * vertex_normals(body.vertices, body.faces)[near])
+        faces.append(count + (own if outward >= 0 else own[:, ::-1]))
+        count += len(rest)
+    return np.concatenate(faces)
+
+
+def _covered(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarray:
+    """Which body vertices (body,) a garment below lies over: the nearest point of it is in front of them and not at its rim.
+
+    They are no part of what the garment above touches, as there is cloth between; with them, it would be held off by the skin
+    where it is through the cloth.
+    """
+    from scipy.spatial import cKDTree
+
+    hidden, normals = np.zeros(len(body.vertices), bool), vertex_normals(body.vertices, body.faces)
+    for layer in under:
+        rest, faces = np.asarray(layer.rest), np.asarray(layer.model.garment.mesh.faces)
+        away, near = cKDTree(rest).query(body.vertices)
+        gap = rest[near] - body.vertices
+        rim = rest[np.concatenate([*boundary_loops(faces), np.zeros(0, int)]).astype(int)]
+        inner = np.ones(len(body.vertices), bool) if not len(rim) else cKDTree(rim).query(body.vertices)[0] > RIM
+        hidden |= (away < COVER) & inner & (np.sum(gap * normals, axis=1) > 0.5 * away)
+    return hidden
+
+
+def _prepare(scene, body, garment, mesh, pins, under, records) -> Prepared:
     moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in records)
     basis = np.zeros((len(garment.vertices), 0), np.float32)
     if scene.network.modes:
@@ -207,6 +271,8 @@ def _prepare(scene, body, garment, mesh, pins, records) -> Prepared:
     part = np.zeros(0, np.int64)
     if scene.physics.collision.stiffness > 0:
         part = _part(scene, body, garment, weights, records)
+        if under:
+            part = part[~_covered(body, under)[part]]
     wanted = used_joints(body.parents.tolist(), np.concatenate([weights, body.weights[part]]))
     if moves:  # a joint that never turns tells the network nothing
         turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in records], axis=0)
@@ -215,7 +281,7 @@ def _prepare(scene, body, garment, mesh, pins, records) -> Prepared:
     return Prepared(np.asarray(inputs), np.asarray(moves), weights.astype(np.float32), part, basis)
 
 
-def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model:
+def _model(scene, prepared: Prepared, body, garment, mesh, pins, under, dtype) -> Model:
     physics = scene.physics
     parents, joints, rest_rotations, body_weights = np.array([-1]), np.zeros((1, 3)), None, np.zeros((0, 1))
     if body is not None:
@@ -275,6 +341,7 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, dtype) -> Model
         descriptor=scene.network.descriptor,
         fps=scene.motion.fps,
         moves=moves,
+        under=under if collides else (),
     )
 
 
@@ -303,7 +370,7 @@ def _surface(model: Model, faces, track: Track | None, smooth: bool, samples: in
     if track is not None:
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
         poses = list(zip(*map(np.asarray, jax.jit(jax.vmap(posed))(track.matrices[frames])), strict=True))
-    rest, body = np.asarray(model.garment.mesh.rest), np.asarray(model.body)
+    rest, body = np.asarray(model.garment.mesh.rest), np.concatenate([model.body, *(layer.rest for layer in model.under)])
     return surface_from(rest, body, faces, smooth=smooth, posed=poses)
 
 
@@ -329,7 +396,21 @@ def track_of(model: Model, *records: io.MotionRecord) -> Track:
     origins = [CELL * np.round(r.translation[0].astype(np.float64) / CELL) for r in records]
     near = np.concatenate([r.translation - origin for r, origin in zip(records, origins, strict=True)])
     found = track(model, local_rotations(model, poses), jnp.asarray(near.astype(dtype)), jnp.asarray(start, jnp.int32))
+    if model.under:
+        moved = jnp.concatenate([_moved(layer, records, origins, dtype) for layer in model.under], axis=1)
+        found = replace(found, matrices=jnp.concatenate([found.matrices, moved], axis=1))
     return replace(found, origin=jnp.asarray(np.repeat(origins, lengths, axis=0), dtype)) if np.any(origins) else found
+
+
+def _moved(layer: Layer, records, origins, dtype) -> Float[Array, "frames verts 3 4"]:
+    """What takes each vertex of a garment below from its rest to its place, measured from the motions' origins."""
+    x = [
+        animated(layer.model, layer.network, layer.params, track_of(layer.model, record)) - origin
+        for record, origin in zip(records, origins, strict=True)
+    ]
+    way = jnp.asarray(np.concatenate(x), dtype) - layer.rest
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*way.shape[:2], 3, 3))
+    return jnp.concatenate([eye, way[..., None]], axis=-1)
 
 
 def _network(scene: Scene, model: Model) -> Method:

@@ -57,9 +57,10 @@ def hem(model: Model) -> np.ndarray:
     return np.argsort(height, kind="stable")[: max(1, round(HEM * len(height)))]
 
 
-def stops(track: Track, fps: float) -> Iterator[tuple[int, int]]:
+def stops(track: Track, model: Model) -> Iterator[tuple[int, int]]:
     """(first still frame, one past the last) wherever the character has moved and then does not for `STILL` seconds."""
-    matrices, start = np.asarray(track.matrices, np.float64), np.asarray(track.start)
+    fps, joints = model.fps, len(model.skeleton.parents)  # what is worn below may go on moving
+    matrices, start = np.asarray(track.matrices[:, :joints], np.float64), np.asarray(track.start)
     moved = np.abs(np.diff(matrices, axis=0)).reshape(len(matrices) - 1, -1).max(axis=1, initial=0) > 1e-6
     moving = np.concatenate([[False], moved & (start[1:] == start[:-1])])
     frame = 0
@@ -127,7 +128,7 @@ def dynamics(model: Model, vertices, track: Track) -> dict[str, float]:
     carried = np.asarray(_carried(model, track.matrices), np.float64)[:, low].mean(axis=1)
     path = track.relative(vertices).astype(np.float64)[:, low].mean(axis=1)
     found = {"speed": _speed(u, track, fps), "lag": _lag(path, carried, fps)}
-    after = [_after(u[first - 1 : last, low].astype(np.float64).mean(axis=1), fps) for first, last in stops(track, fps)]
+    after = [_after(u[first - 1 : last, low].astype(np.float64).mean(axis=1), fps) for first, last in stops(track, model)]
     if after:
         times = [time for time, _ in after if time is not None]
         if times:
@@ -149,7 +150,7 @@ def compare(model: Model, vertices, reference, track: Track) -> dict[str, float]
     a, b = ((path - path.mean(axis=0)).ravel() for path in paths)
     size = np.linalg.norm(a) * np.linalg.norm(b)
     found = {"dynamic_share": share()}
-    still = [np.arange(first, last) for first, last in stops(track, fps)]
+    still = [np.arange(first, last) for first, last in stops(track, model)]
     if still:
         found["stopped_share"] = share(np.concatenate(still))
     found["hem_correlation"] = float(a @ b / size) if size > 0 else float("nan")

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.assembly import Assembly
+from ncs_jax.assembly import Assembly, track_of
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
-from ncs_jax.kinematics import blend, forward, skin, transforms
+from ncs_jax.io import MotionRecord
+from ncs_jax.kinematics import blend, skin
 from ncs_jax.model import Model, local_rotations, pose_body
 from ncs_jax.scene import Scene
 
@@ -97,21 +98,20 @@ def _mesh(a: Assembly) -> Iterator[Finding]:
 
 
 @jax.jit
-def _depths(model: Model, local, translation):
+def _depths(model: Model, matrices):
     """Signed distances to the body of the garment as the body alone carries it, frame by frame, m."""
 
-    def depth(frame):
-        matrices = transforms(model.skeleton, forward(model.skeleton, *frame))
+    def depth(matrices):
         x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
         index, _ = nearest_triangle(x, body, model.surface)
         return triangle_distance(x, body, model.surface, index)
 
-    return jax.lax.map(depth, (local, translation))
+    return jax.lax.map(depth, matrices)
 
 
 def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Finding]:
-    local = local_rotations(model, jnp.asarray(poses, model.basis.dtype))
-    depth = -np.asarray(_depths(model, local, jnp.zeros((len(poses), 3), model.basis.dtype)))
+    still = [MotionRecord(pose[None], np.zeros((1, 3), poses.dtype), model.fps) for pose in poses]
+    depth = -np.asarray(_depths(model, track_of(model, *still).matrices))
     share = float((depth > deep).mean(axis=1).max())
     if share > many:
         value = f"{100 * share:.1f} % of its vertices by more than {1000 * deep:.0f} mm, up to {1000 * depth.max():.1f} mm"

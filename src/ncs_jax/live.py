@@ -21,7 +21,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
-from ncs_jax.preview import posed_body
+from ncs_jax.preview import worn_over
 from ncs_jax.reports import animation_over
 from ncs_jax.runs import Run, load_run
 from ncs_jax.scene import load_scene
@@ -171,7 +171,8 @@ class View:
         self.server.initial_camera.fov = np.radians(40)
         mesh = functools.partial(scene.add_mesh_simple, side="double")
         self.cloth = mesh("/garment", rest, self.faces, color=CLOTH)
-        self.body = None if body is None else mesh("/body", body.vertices, body.faces, color=SKIN)
+        posed, faces = worn_over(self.what.run.assembly, self.what.run.motion(self.what.motions[0]))
+        self.body = None if posed is None else mesh("/body", posed[0], faces, color=SKIN)
         self.other = mesh("/overlay", rest, self.faces, color=OTHER, opacity=0.5, visible=False)
         one = np.zeros((3, 3), np.float32)
         self.bins = [
@@ -210,8 +211,7 @@ class View:
             run, name = self.what.run, self.motion.value
             self.track = run.track(name)
             self.vertices = self.what.animate(name, float(self.alpha.value))
-            body = run.assembly.body
-            self.posed = None if body is None else posed_body(body, run.motion(name))
+            self.posed, _ = worn_over(run.assembly, run.motion(name))
             self.fps = run.assembly.model.fps
             self.scrub.max = max(len(self.vertices) - 1, 1)
             self.frame, self._dirty = self.frame % len(self.vertices), True

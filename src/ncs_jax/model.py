@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,11 +44,24 @@ class Vibrations:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Layer:
+    """A garment worn below, which collides as a part of the body: what animates it, and its place (verts, 3) at rest, m."""
+
+    model: Model
+    params: dict
+    rest: Float[Array, "verts 3"]
+    network: Any = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Model:
     """Constants of a scene. The skeleton holds only the joints that matter, the `source_joints` of the motion's.
 
     `inputs` are the joints that the network reads, the root first. `body` and its `surface` are the part of the body that the
-    garment can touch, `None` in a scene without a body or without collision.
+    garment can touch, `None` in a scene without a body or without collision. To the surface also belong the garments `under`
+    this one, after the body: each of their vertices goes by a transform of its own, which a track has after those of the
+    joints.
     """
 
     skeleton: Skeleton
@@ -66,11 +80,17 @@ class Model:
     fps: float = field(metadata={"static": True})
     moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
     vibrations: Vibrations | None = None  # where the network swings along them
+    under: tuple[Layer, ...] = ()  # garments worn below this one
 
 
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
-    """The touchable body in one frame or several, m."""
-    return skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + (1,) * (matrices.ndim - 3)))
+    """The touchable body in one frame or several, and the garments under this one, m."""
+    lanes = (1,) * (matrices.ndim - 3)
+    body = skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + lanes))
+    if not model.under:
+        return body
+    rest = jnp.concatenate([layer.rest for layer in model.under])
+    return jnp.concatenate([body, rest.reshape(rest.shape + lanes) + matrices[len(model.skeleton.parents) :, :, 3]])
 
 
 def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:

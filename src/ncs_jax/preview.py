@@ -11,13 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.assembly import Assembly, track_of
 from ncs_jax.errors import InputError
 from ncs_jax.evaluation import summarise
 from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.rollout import animated
 from ncs_jax.rotations import axis_angle_to_matrix
 from ncs_jax.runs import Run
 
-__all__ = ["posed_body", "preview"]
+__all__ = ["posed_body", "preview", "worn_over"]
 
 ALPHAS = (0.0, 1.0, 1.5)
 
@@ -38,6 +40,17 @@ def posed_body(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
     return np.asarray(run(local, jnp.asarray(motion.translation, jnp.float32)))
 
 
+def worn_over(a: Assembly, motion: io.MotionRecord) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """What a garment is worn over, body and garments below, as one mesh: vertices (frames, verts, 3) in m, and faces."""
+    if a.body is None:
+        return None, None
+    vertices, faces = [posed_body(a.body, motion)], [a.body.faces]
+    for layer in a.model.under:
+        faces.append(np.asarray(layer.model.garment.mesh.faces) + sum(v.shape[1] for v in vertices))
+        vertices.append(animated(layer.model, layer.network, layer.params, track_of(layer.model, motion)))
+    return np.concatenate(vertices, axis=1), np.concatenate(faces)
+
+
 def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: str = "") -> dict[str, float]:
     """Write preview.png, preview.gif, preview.html and energies.png into a folder; return the motion's evaluation at alpha 1.
 
@@ -49,7 +62,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     from ncs_jax import pictures, viewer
 
     folder = Path(folder)
-    scene, body = run.assembly.scene, run.assembly.body
+    scene = run.assembly.scene
     names = (motion,) if motion else (*scene.motion.validation, *scene.motion.files)
     if not names:
         raise InputError("a motion to show is needed", field="motion.files", mend="name one in the scene")
@@ -59,9 +72,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     animations = {f"{alpha:g}": run.animate(track, alpha) for alpha in alphas}
     garment = animations["1"] if "1" in animations else animations["0"]
     faces = run.assembly.garment.faces
-    body_vertices = body_faces = None
-    if body is not None:
-        body_vertices, body_faces = posed_body(body, run.motion(name)), body.faces
+    body_vertices, body_faces = worn_over(run.assembly, run.motion(name))
     fps = run.assembly.model.fps
     quantities = summarise(run.evaluate(track))
     facts = {

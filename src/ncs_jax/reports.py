@@ -131,6 +131,8 @@ def check(options) -> int:
     print(f"  file      {record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if model.body is not None:
         print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+    for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
+        print(f"  over      {name}: {len(layer.rest)} vertices")
     print(f"  joints    {', '.join(joints)}")
     print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
     scene = assembly.scene

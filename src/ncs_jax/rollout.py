@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -20,9 +20,10 @@ from ncs_jax.methods.shared import Method, decode, for_inference, garment_blend
 from ncs_jax.model import Model
 from ncs_jax.motion import Track, input_joints
 
-__all__ = ["Rollout", "State", "animate", "first_broken", "stepper"]
+__all__ = ["Rollout", "State", "animate", "animated", "first_broken", "stepper"]
 
 BLOCK = 32  # garments decoded and skinned together
+PADDED = 64  # frames in whole blocks of which a motion is animated
 
 
 @jax.tree_util.register_dataclass
@@ -118,9 +119,21 @@ def animate(
         track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
             dynamic (alpha = 0 gives the same vertices).
     """
+    if model.under:
+        track = replace(track, matrices=track.matrices[:, : len(model.skeleton.parents)])
     codes, weights = network.codes(params, model, track), garment_blend(network, params, model)
     x = _posed(model, network, params, weights, track.matrices, codes.together(alpha), codes.swung(alpha))
     return track.absolute(x)
+
+
+_animate = jax.jit(animate, static_argnums=1)
+
+
+def animated(model: Model, network: Method, params: dict, track: Track, alpha: float = 1.0) -> np.ndarray:
+    """The same as NumPy, compiled: the last frame is repeated up to whole blocks, so that motions of many lengths share it."""
+    frames = track.start.shape[0]
+    padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % PADDED)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
+    return np.asarray(_animate(model, network, params, padded, float(alpha)))[:frames]
 
 
 def first_broken(model: Model, network: Method, params: dict, track: Track, alpha: float = 1.0) -> str:

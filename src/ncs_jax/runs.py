@@ -21,11 +21,11 @@ from ncs_jax.checkpoint import Checkpoints, check_writable, read_prepared, read_
 from ncs_jax.compression import compress
 from ncs_jax.devices import batch_mesh, compiled, copied, divided, give_back, local
 from ncs_jax.errors import InputError
-from ncs_jax.evaluation import BLOCK, measure, summarise
+from ncs_jax.evaluation import measure, summarise
 from ncs_jax.export import Exported, export
 from ncs_jax.methods.swing import Swing
 from ncs_jax.motion import Track
-from ncs_jax.rollout import animate, first_broken
+from ncs_jax.rollout import animated, first_broken
 from ncs_jax.scene import Scene, load_scene, scene_from
 from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, diagnose, glance, initial_state, with_bodies
 
@@ -82,11 +82,8 @@ class Run:
             InputError: a vertex is not finite: where, and what was so first.
         """
         track = self.track(motion) if isinstance(motion, str) else motion
-        frames = track.start.shape[0]
-        # The last frame is repeated up to a whole number of blocks: motions of many lengths share a compilation.
-        padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % BLOCK)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
         a = self.assembly
-        x = np.asarray(_animate(a.model, a.network, self.params, padded, float(alpha)))[:frames]
+        x = animated(a.model, a.network, self.params, track, alpha)
         if not np.isfinite(np.sum(x)):
             what = motion if isinstance(motion, str) else "a track"
             broken = first_broken(a.model, a.network, self.params, track, float(alpha))
@@ -144,9 +141,6 @@ class Run:
         """Physical quantities per frame, see `evaluation.QUANTITIES` and `evaluation.measure`."""
         track = self.track(motion) if isinstance(motion, str) else motion
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
-
-
-_animate = jax.jit(animate, static_argnums=1)
 
 
 def load_run(folder: str | Path) -> Run:

@@ -69,6 +69,7 @@ class GarmentSpec:
     smoothing: int = _f(10, "how many times the skinning weights are averaged over the garment", low=0, high=10000)
     pins: str = _f("", "name of the vertex group that is pinned; empty: none")
     learn_weights: bool = _f(False, "train the skinning weights too")
+    over: tuple[str, ...] = _f((), "run folders of the garments below it, trained before, which collide as part of the body")
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,7 @@ class Scene:
 
         tables["body"]["file"] = absolute(tables["body"]["file"])
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
+        tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
         for key in ("files", "validation"):
             tables["motion"][key] = [absolute(name) for name in tables["motion"][key]]
         return tables

@@ -1,0 +1,134 @@
+"""A garment worn over another one, which collides as part of the body."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax import InputError, Run, assemble, load_run, load_scene, measure, simulate, train
+from ncs_jax.cli import main
+from ncs_jax.energies.collision import nearest_vertex, plane_distance, vertex_normals
+from ncs_jax.model import pose_body
+
+from .scenes import SCENE, write_scene
+from .shapes import tube
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _plain():
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A sleeve around the upper half of the post, learned, and the scene of a wider one over it."""
+    folder = tmp_path_factory.mktemp("layers")
+    write_scene(folder)
+    for name, radius in (("inner", 0.1), ("outer", 0.115)):
+        x, faces = tube(24, 14, radius, 0.5)
+        pins = np.arange(13 * 24, 14 * 24)
+        np.savez(folder / f"{name}.npz", vertices=x + [0, 0.35, 0], faces=faces, group_pins=pins)
+        text = SCENE.replace('"cloth.npz"', f'"{name}.npz"\npins = "pins"')
+        (folder / f"{name}.toml").write_text(text)
+    train(load_scene(folder / "inner.toml"), folder / "run", steps=20)
+    text = (folder / "outer.toml").read_text().replace("smoothing = 2", 'smoothing = 2\nover = ["run"]')
+    (folder / "outer.toml").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def worn(folder):
+    return assemble(load_scene(folder / "outer.toml"))
+
+
+def test_what_collides_is_the_body_and_the_garment_below_where_it_is(folder, worn):
+    """Its vertices are those that its own run animates, frame by frame, and its triangles are appended to the body's."""
+    below, model, track = load_run(folder / "run"), worn.model, worn.track
+    x = below.animate(str(folder / "swing.npz"))
+    bodies = np.asarray(jax.vmap(lambda m: pose_body(model, m))(track.matrices))
+    np.testing.assert_allclose(bodies[:, len(model.body) :], x, atol=1e-6)
+    assert model.surface.faces.max() == bodies.shape[1] - 1
+    own = np.asarray(below.assembly.garment.faces)
+    np.testing.assert_array_equal(np.asarray(model.surface.faces)[-len(own) :] - len(model.body), own)
+
+
+def test_skin_that_is_covered_does_not_collide(worn):
+    """But for a band along the rims of what covers it, where it may be bared."""
+    part = worn.body.vertices[worn.prepared.part]
+    assert len(part) and not np.any(
+        (part[:, 1] > 0.46) & (part[:, 1] < 0.74) & (np.linalg.norm(part[:, [0, 2]], axis=1) > 0.07)
+    )
+    assert np.any((part[:, 1] > 0.75) & (part[:, 1] < 0.85)) and np.any(part[:, 1] < 0.44)
+
+
+def test_cloth_through_the_garment_below_is_pushed_out_by_it(folder, worn):
+    """A ring 5 mm inside the garment below and 15 mm off the skin is inside; on skin alone it would be outside."""
+    model, track = worn.model, worn.track
+    body = pose_body(model, track.matrices[0])
+    x = jnp.asarray(worn.garment.vertices * [0.095 / 0.115, 1, 0.095 / 0.115], jnp.float32)
+    middle = np.asarray((x[:, 1] > 0.5) & (x[:, 1] < 0.7))
+    index, _ = nearest_vertex(x, body, model.surface)
+    distance = np.asarray(plane_distance(x, body, vertex_normals(body, model.surface), index))
+    assert distance[middle].max() < 0
+    bare = assemble(dataclasses.replace(worn.scene, garment=dataclasses.replace(worn.scene.garment, over=())))
+    body = pose_body(bare.model, bare.track.matrices[0])
+    index, _ = nearest_vertex(x, body, bare.model.surface)
+    assert np.asarray(plane_distance(x, body, vertex_normals(body, bare.model.surface), index))[middle].min() > 0.01
+
+
+def test_a_garment_that_faces_inward_collides_outward(folder, worn):
+    inward = load_scene(folder / "inner.toml")
+    arrays = dict(np.load(folder / "inner.npz"))
+    np.savez(folder / "inward.npz", **{**arrays, "faces": arrays["faces"][:, ::-1]})
+    inward = dataclasses.replace(inward, garment=dataclasses.replace(inward.garment, file="inward.npz"))
+    train(inward, folder / "inward", steps=2)
+    over = dataclasses.replace(worn.scene.garment, over=("inward",))
+    turned = assemble(dataclasses.replace(worn.scene, garment=over)).model.surface.faces
+    np.testing.assert_array_equal(np.sort(turned, axis=1), np.sort(worn.model.surface.faces, axis=1))
+    body = pose_body(worn.model, worn.track.matrices[0])
+    surface = dataclasses.replace(worn.model.surface, faces=turned)
+    around = np.sum(vertex_normals(body, surface) * vertex_normals(body, worn.model.surface), axis=1)
+    np.testing.assert_allclose(around[len(worn.model.body) :], 1, atol=1e-3)
+
+
+def test_train_load_animate_check_and_simulate(folder, capsys):
+    run = train(folder / "outer.toml", folder / "over", steps=20, report=None)
+    again = load_run(folder / "over")
+    motion = str(folder / "swing.npz")
+    np.testing.assert_array_equal(again.animate(motion), run.animate(motion))
+    assert np.isfinite(again.evaluate(motion)["collision"]).all()
+    assert main(["check", str(folder / "outer.toml")]) == 0
+    assert "over      run: 336 vertices" in capsys.readouterr().out
+    assert run.evaluate(motion)["penetrating"].shape == (24,)
+
+
+def test_it_is_simulated_over_the_garment_below(worn):
+    """With smooth contact, which converges: each frame to tolerance, and outside the garment below."""
+    collision = dataclasses.replace(worn.scene.physics.collision, distance="smooth")
+    scene = dataclasses.replace(
+        worn.scene,
+        physics=dataclasses.replace(worn.scene.physics, collision=collision),
+        motion=dataclasses.replace(worn.scene.motion, frames=(0, 8)),
+    )
+    found = simulate(scene, "swing.npz")
+    assert found.status.max() == 0
+    run = Run(found.assembly, {})
+    depth = measure(run.assembly.model, found.vertices, run.track("swing.npz"))["depth_max"]
+    assert depth.max() < 1  # mm
+
+
+def test_a_garment_below_of_another_rate_or_body_is_refused(folder, worn):
+    def changed(**tables):
+        return dataclasses.replace(worn.scene, **tables)
+
+    with pytest.raises(InputError, match=r"garment\.over\[0\]: a garment trained at 60 frames per second expected \(found 30"):
+        assemble(changed(motion=dataclasses.replace(worn.scene.motion, fps=60.0)))
+    body = dict(np.load(folder / "body.npz"))
+    np.savez(folder / "other.npz", **{**body, "vertices": 1.01 * body["vertices"]})
+    with pytest.raises(InputError, match=r"garment\.over\[0\]: a garment on the same body expected"):
+        assemble(changed(body=dataclasses.replace(worn.scene.body, file="other.npz")))
+    with pytest.raises(InputError, match=r"run\.json: no run there"):
+        assemble(changed(garment=dataclasses.replace(worn.scene.garment, over=("gone",))))
