@@ -92,6 +92,17 @@ def test_the_page_plays_scrubs_and_colours(carried):
         window.close()
 
 
+def test_a_notebook_shows_the_page_which_plays_until_it_is_closed(scene):
+    window = view(str(scene), port=0)
+    try:
+        assert f'src="{window.address}"' in window._repr_html_()
+        player = window._player
+        assert player.is_alive() and window._repr_html_() and window._player is player
+    finally:
+        window.close()
+    assert not player.is_alive()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_a_browser_shows_a_run(scene, tmp_path):

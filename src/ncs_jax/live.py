@@ -147,6 +147,8 @@ class View:
         import viser
 
         self.what, self.overlays, self.frame, self._dirty = what, overlays, 0, True
+        self._closed = False
+        self._player: threading.Thread | None = None
         self._lock = threading.RLock()
         self.server = viser.ViserServer(host, port, label=what.title, verbose=False)
         self.faces = np.asarray(what.run.assembly.garment.faces)
@@ -262,7 +264,7 @@ class View:
     def wait(self, seconds: float | None = None) -> None:
         """Play until interrupted, or for some seconds."""
         end = None if seconds is None else time.monotonic() + seconds
-        while end is None or time.monotonic() < end:
+        while not self._closed and (end is None or time.monotonic() < end):
             began = time.monotonic()
             with self._lock:
                 if self.playing.value and len(self.server.get_clients()):
@@ -273,7 +275,17 @@ class View:
 
     def close(self) -> None:
         """End the server."""
+        self._closed = True
+        if self._player is not None:
+            self._player.join()
         self.server.stop()
+
+    def _repr_html_(self) -> str:
+        """As a notebook shows it: the page, which plays until it is closed, in a browser that reaches this machine's port."""
+        if self._player is None:
+            self._player = threading.Thread(target=self.wait, daemon=True)
+            self._player.start()
+        return f'<iframe src="{self.address}" width="100%" height="600" style="border: 0"></iframe>'
 
 
 def view(
