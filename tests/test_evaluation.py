@@ -62,9 +62,20 @@ def test_depth_and_share_of_what_is_inside(assembly):
     np.testing.assert_allclose(rows["penetrating"], [0, 20], atol=1e-5)
     assert rows["depth_max"][0] == 0
     assert 80 * np.cos(np.pi / 12) - 60 <= rows["depth_max"][1] <= 20  # a side's middle, a corner
+    assert rows["middle_depth_max"][0] == 0 and rows["middle_depth_max"][1] == pytest.approx(rows["depth_max"][1], abs=1e-3)
     fast = measure(model, x, still(model, 2), exact=False)
+    assert "middle_depth_max" not in fast
     # The next columns are half a millimetre outside a side, and inside the plane through its corner.
     np.testing.assert_allclose(fast["penetrating"], [0, 60], atol=1e-5)
+
+
+def test_skin_between_vertices(assembly):
+    """Columns 5 cm apart on both sides of the post's corner, 2 mm inside of which the edges pass."""
+    model = assembly.model
+    x = np.asarray(model.garment.mesh.rest) + [0.025, 0, 0.078 - 0.09]
+    rows = measure(model, x[None].repeat(2, axis=0), still(model, 2))
+    assert rows["depth_max"][0] == 0 and 1.5 < rows["middle_depth_max"][0] <= 2
+    assert summarise(rows)["middle_depth_max"] == rows["middle_depth_max"].max()
 
 
 def test_a_free_fall_is_in_balance(tmp_path):

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import angles
-from ncs_jax.energies.collision import nearest_triangle, triangle_distance
+from ncs_jax.energies.collision import Surface, nearest_triangle, surface_from, triangle_distance
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.proximity import Groups, groups_from, intersecting
@@ -35,13 +35,14 @@ QUANTITIES = {
     "hinge_mean": ("deg", "mean |phi - phi_rest| over the hinges"),
     "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
     "depth_max": ("mm", "deepest penetration"),
+    "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
 
 
 def _frame(
-    model: Model, exact: bool, groups: Groups | None, x, previous, before, matrices, matrices_before
+    model: Model, exact: bool, groups: Groups | None, middles: Surface | None, x, previous, before, matrices, matrices_before
 ) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
     origin = matrices[:1, :, 3]  # seen from the root joint, where single precision is finest
@@ -87,6 +88,10 @@ def _frame(
             depth = -distances(x, body, model.surface, terms)
         result["penetrating"] = 100 * jnp.mean(depth > 0)
         result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
+        if middles is not None:
+            between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
+            index, _ = nearest_triangle(between, body, middles)
+            result["middle_depth_max"] = 1000 * jnp.maximum(jnp.max(-triangle_distance(between, body, middles, index)), 0)
     if groups is not None:
         through, overflow = intersecting(x, mesh, groups)
         result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
@@ -94,11 +99,21 @@ def _frame(
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _measure(model, exact, groups, *frames):
-    return lax.map(lambda frame: _frame(model, exact, groups, *frame), frames)
+def _measure(model, exact, groups, middles, *frames):
+    return lax.map(lambda frame: _frame(model, exact, groups, middles, *frame), frames)
 
 
-_SUMMARY: dict[str, Callable[..., np.floating]] = {"depth_max": np.max, "out_of_balance": np.median}
+def _middles(model: Model) -> Surface:
+    """What the search for the nearest triangle knows of the middles of the edges."""
+    mesh = model.garment.mesh
+    between = np.asarray((mesh.rest[mesh.edges[:, 0]] + mesh.rest[mesh.edges[:, 1]]) / 2)
+    body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
+    return surface_from(between, body, np.asarray(model.surface.faces))
+
+
+_SUMMARY: dict[str, Callable[..., np.floating]] = {
+    "depth_max": np.max, "middle_depth_max": np.max, "out_of_balance": np.median,
+}  # fmt: skip
 
 BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
 
@@ -116,7 +131,8 @@ def measure(
     Args:
         vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
 
-        exact: penetration by the exact signed distance to the body's triangles; else by the scene's own query, which is faster.
+        exact: penetration by the exact signed distance to the body's triangles, also of the middles of the edges; else by the
+            scene's own query, which is faster.
         self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
 
     Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
@@ -128,10 +144,14 @@ def measure(
     if model.terms.self_contact if self_contact is None else self_contact:
         groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups
 
+    middles = _middles(model) if exact and model.surface is not None else None
+
     def block(first):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
         three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
-        return jax.device_get(_measure(model, exact, groups, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)]))
+        return jax.device_get(
+            _measure(model, exact, groups, middles, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)])
+        )
 
     first, *others = range(0, frames, BLOCK)
     blocks = [block(first)]  # compiles
@@ -141,5 +161,5 @@ def measure(
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
-    """Means over the frames; the largest for `depth_max`, the median for `out_of_balance`."""
+    """Means over the frames; the largest for `depth_max` and `middle_depth_max`, the median for `out_of_balance`."""
     return {name: float(_SUMMARY.get(name, np.mean)(values)) for name, values in rows.items()}
