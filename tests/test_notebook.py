@@ -1,20 +1,72 @@
-"""The notebook runs from top to bottom, with less training."""
+"""The notebooks run from top to bottom, with less training; and they hold the outputs that their pages show."""
 
 from pathlib import Path
 
 import nbformat
+import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parents[1] / "notebooks" / "quickstart.ipynb"
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+def ran(name, tmp_path, first=None):
+    """The notebook after it ran, another first line of code in place of its own; what its cells printed."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    if first is not None:
+        assert notebook.cells[1].source.startswith(first.split("=")[0])
+        notebook.cells[1].source = first
+    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    return notebook, ["".join(o.get("text", "") for o in c.get("outputs", [])) for c in notebook.cells]
+
+
+def drawn(notebook):
+    """How many pictures its cells show."""
+    outputs = [o for c in notebook.cells for o in c.get("outputs", [])]
+    return sum(o.output_type == "display_data" and "image/png" in o.data for o in outputs)
 
 
 def test_quickstart(tmp_path):
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    assert notebook.cells[1].source.startswith("steps = ")
-    notebook.cells[1].source = "steps = 10"
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    printed = {i: "".join(o.get("text", "") for o in c.get("outputs", [])) for i, c in enumerate(notebook.cells)}
-    assert any("strain_mean" in text for text in printed.values())
-    difference = next(text for text in printed.values() if "largest difference" in text)
+    notebook, printed = ran("quickstart", tmp_path, "steps = 10")
+    assert any("strain_mean" in text for text in printed)
+    difference = next(text for text in printed if "largest difference" in text)
     assert float(difference.split()[-2]) < 1e-5
-    assert any(o.output_type == "display_data" and "image/png" in o.data for c in notebook.cells for o in c.get("outputs", []))
+    assert drawn(notebook) == 1
+
+
+def test_energies(tmp_path):
+    notebook, printed = ran("energies", tmp_path)
+    checks = [line.split() for text in printed for line in text.splitlines() if "by differences" in line]
+    assert len(checks) == 4
+    for *_, slope, _, measured, _, _ in checks:
+        assert float(slope) == pytest.approx(float(measured), rel=1e-2)
+    assert any("finite: True" in text for text in printed) and drawn(notebook) == 1
+
+
+@pytest.mark.slow
+def test_training(tmp_path):
+    notebook, printed = ran("training", tmp_path, "steps = 10")
+    assert any("gain" in text for text in printed) and drawn(notebook) == 2
+
+
+@pytest.mark.slow
+def test_simulation(tmp_path):
+    notebook, printed = ran("simulation", tmp_path, "frames = 4")
+    assert any("all at tolerance: True" in text for text in printed) and drawn(notebook) == 1
+    slope, measured = next((float(t.split()[0]), float(t.split()[-1])) for t in printed if "by differences" in t)
+    assert slope == pytest.approx(measured, rel=0.05)
+
+
+@pytest.mark.slow
+def test_inference(tmp_path):
+    _, printed = ran("inference", tmp_path, "steps = 5")
+    difference = next(line for text in printed for line in text.splitlines() if "largest difference" in line)
+    assert float(difference.split()[-2]) < 1e-5
+    assert any("tshirt.onnx" in text for text in printed)
+
+
+@pytest.mark.parametrize("notebook", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_the_outputs_are_those_of_its_cells(notebook):
+    """Every code cell was run, in order, without an error."""
+    cells = [c for c in nbformat.read(notebook, as_version=4).cells if c.cell_type == "code"]
+    assert [c.execution_count for c in cells] == list(range(1, len(cells) + 1))
+    assert not any(o.output_type == "error" for c in cells for o in c.outputs)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ __all__ = [
     "nearest_triangle",
     "nearest_vertex",
     "plane_distance",
+    "relisted",
     "surface_from",
     "triangle_distance",
     "vertex_normals",
@@ -75,19 +76,30 @@ def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
     return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
 
 
+def _boxed(points, blocks):
+    """Lowest and highest corners (3, groups) of the boxes around groups of points (count, 3) or of triangles' corners."""
+    grouped = np.asarray(points, np.float32)[blocks].reshape(len(blocks), -1, 3)
+    return grouped.min(axis=1).T, grouped.max(axis=1).T
+
+
 def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
     """The `count` body groups that come nearest to each cloth group in any pose [(cloth, body)]: (count, cloth groups)."""
-    least = np.full((len(cloth_blocks), len(body_blocks)), np.inf)
+    least = np.full((len(cloth_blocks), len(body_blocks)), np.inf, np.float32)
     for cloth, body in posed:
-        low, high, below, above = (
-            f(points[blocks].reshape(len(blocks), -1, 3), axis=1)
-            for points, blocks in ((cloth, cloth_blocks), (body, body_blocks))
-            for f in (np.min, np.max)
-        )
-        apart = np.maximum(np.maximum(below[None] - high[:, None], low[:, None] - above[None]), 0)
-        centres = (low + high)[:, None] / 2 - (below + above)[None] / 2
-        least = np.minimum(least, np.linalg.norm(apart, axis=-1) + 1e-3 * np.linalg.norm(centres, axis=-1))
+        (low, high), (below, above) = _boxed(cloth, cloth_blocks), _boxed(body, body_blocks)
+        apart = centres = np.zeros(())
+        for i in range(3):
+            gap = np.maximum(np.maximum(below[i] - high[i][:, None], low[i][:, None] - above[i]), 0)
+            middle = (low[i] + high[i])[:, None] / 2 - (below[i] + above[i]) / 2
+            apart, centres = apart + gap * gap, centres + middle * middle
+        np.minimum(least, np.sqrt(apart) + 1e-3 * np.sqrt(centres), out=least)
     return np.argsort(least, axis=1, kind="stable")[:, :count].T.astype(np.int32)
+
+
+def relisted(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
+    """The same, its search for the nearest vertex prepared for what is near what in these poses [(cloth, body)]."""
+    lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
+    return replace(surface, vertex_lists=jax.device_put(lists))
 
 
 def surface_from(
