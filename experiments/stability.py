@@ -108,13 +108,16 @@ class Wearer:
 
     def vertices(self, record: MotionRecord, alpha: float = 1.0) -> list[np.ndarray]:
         """Seen from the root, in float32 and in float64."""
-        found = []
-        for a, dtype in ((self.assembly, jnp.float32), (self.double, jnp.float64)):
-            track = track_of(a.model, record)
-            params = jax.tree.map(lambda p, dtype=dtype: jnp.asarray(p, dtype), self.params)
-            x = track.relative(animated(a.network, a.model, params, track, jnp.asarray(alpha, dtype)))
-            found.append(x.astype(np.float64) - np.asarray(track.matrices[:, 0, :, 3], np.float64)[:, None])
-        return found
+        both = ((self.assembly, jnp.float32), (self.double, jnp.float64))
+        return [worn(a, self.params, record, alpha, dtype) for a, dtype in both]
+
+
+def worn(a: Any, params: dict, record: MotionRecord, alpha: float, dtype: Any) -> np.ndarray:
+    """Vertices of a trained garment, seen from the root, worked out in a precision."""
+    track = track_of(a.model, record)
+    params = jax.tree.map(lambda p: jnp.asarray(p, dtype), params)
+    x = track.relative(animated(a.network, a.model, params, track, jnp.asarray(alpha, dtype)))
+    return x.astype(np.float64) - np.asarray(track.matrices[:, 0, :, 3], np.float64)[:, None]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -189,7 +192,7 @@ def of_networks(scene: Scene, quick: bool) -> list[dict]:
             rows.append(cell("network", axis, value, apart(single[part], double[part])))
     small = run.compressed(scene.motion.files[0], bfloat16=True)
     for _, alpha, case, _ in (c for c in cases if c[0] == "alpha"):
-        found = Wearer(small.assembly, wearer.double, small.params).vertices(case, alpha)[0]
+        found = worn(small.assembly, small.params, case, alpha, jnp.float32)
         rows.append(cell("network, bfloat16", "alpha", alpha, apart(found, wearer.vertices(case, alpha)[1])))
     for fps in [30] if quick else [1, 5, 15, 30, 60, 120, 240, 1000]:
         once, twice = (replace(b, model=replace(b.model, fps=float(fps))) for b in (a, wearer.double))
