@@ -30,6 +30,7 @@ from experiments.study import axes_of, changed, write
 from ncs_jax import InputError, Scene, assemble, load_scene, train
 from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
+from ncs_jax.methods.swing import Swing
 from ncs_jax.model import Model
 from ncs_jax.motion import Track
 from ncs_jax.objective import Material
@@ -78,6 +79,14 @@ def state(subject: str, error: float) -> str:
 def cell(subject: str, axis: str, value: Any, error: float, **more: Any) -> dict:
     """One row of the map's table."""
     return {"subject": subject, "axis": axis, "value": value, "error": error, "state": state(subject, error), **more}
+
+
+def tried(subject: str, axis: str, value: Any, row: Callable[[], dict]) -> dict:
+    """The row, or that the scene was refused, and why."""
+    try:
+        return row()
+    except InputError as error:
+        return cell(subject, axis, value, np.nan, why=str(error))
 
 
 # Energies
@@ -253,7 +262,10 @@ def learned(axis: str, value: Any, a: Any, seed: int = 0, steps: int = 60) -> di
     spec, network = a.scene.training, cast(Any, a.network)
     track = with_bodies(a.model, a.track, spec.batch)
     ends = batches(len(track.start), spec.batch, seed, 0, steps)
-    end, logs = runner(network, spec)(initial_state(a.model, network, seed), ends, np.zeros_like(ends), steps, a.model, track)
+    state = initial_state(a.model, network, seed)
+    if isinstance(network, Swing):
+        track = replace(track, swing=jax.jit(network.swings)(state.params, a.model, a.track))
+    end, logs = runner(network, spec)(state, ends, np.zeros_like(ends), steps, a.model, track)
     return fall("training", axis, value, end, logs)
 
 
@@ -263,7 +275,8 @@ def of_simulator(scene: Scene, quick: bool) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         for axis, values in SWEPT.items():
             for value in values[:: 9 if quick else 1]:
-                rows.append(simulated_apart(axis, value, functools.partial(hung, Path(folder), axis, value)))
+                made = functools.partial(hung, Path(folder), axis, value)
+                rows.append(tried("simulator", axis, value, functools.partial(simulated_apart, axis, value, made)))
     for name, a in limbs(scene)[: 1 if quick else None]:
         x, solution = simulated(simulator_from(a.model), a.track, Settings())
         left = float(np.max(solution.residual))
@@ -280,7 +293,11 @@ def of_training(scene: Scene, quick: bool) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         for axis, values in SWEPT.items():
             for value in values[:: 9 if quick else 1]:
-                rows.append(learned(axis, value, hung(Path(folder), axis, value, jnp.float32)))
+
+                def learn(axis=axis, value=value):
+                    return learned(axis, value, hung(Path(folder), axis, value, jnp.float32))
+
+                rows.append(tried("training", axis, value, learn))
     return rows
 
 
@@ -377,7 +394,8 @@ def draw(path: Path, rows: Sequence[dict]) -> None:
 
     every = list(dict.fromkeys(r["axis"] for r in rows))
     subjects = list(dict.fromkeys(r["subject"] for r in rows))
-    with axes_of(path, len(every), (3.2, 1.8 + 0.22 * len(subjects))) as panels:
+    longest = max(len(shown(r["value"])) for r in rows)
+    with axes_of(path, len(every), (3.2, 1.8 + 0.22 * len(subjects) + 0.07 * longest)) as panels:
         for place, (axes, axis) in enumerate(zip(panels, every, strict=True)):
             values = list(dict.fromkeys(r["value"] for r in rows if r["axis"] == axis))
             table = np.full((len(subjects), len(values)), np.nan)
