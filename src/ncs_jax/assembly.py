@@ -217,7 +217,7 @@ def _layers(scene: Scene, body: io.BodyRecord | None, dtype) -> tuple[Layer, ...
                 value=model.fps, mend="give both scenes the same motion.fps",
             )  # fmt: skip
         alone = replace(model, body=None, body_blend=None, surface=None, under=())
-        layer = Layer(alone, run.params, model.garment.mesh.rest, run.assembly.network)
+        layer = Layer(alone, run.params, run.assembly.network)
         found.append(jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, layer))
     return tuple(found)
 

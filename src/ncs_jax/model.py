@@ -45,12 +45,16 @@ class Vibrations:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Layer:
-    """A garment worn below, which collides as a part of the body: what animates it, and its place (verts, 3) at rest, m."""
+    """A garment worn below, which collides as a part of the body: what animates it."""
 
     model: Model
     params: dict
-    rest: Float[Array, "verts 3"]
     network: Any = field(metadata={"static": True})
+
+    @property
+    def rest(self) -> Float[Array, "verts 3"]:
+        """Its place at rest, m."""
+        return self.model.garment.mesh.rest
 
 
 @jax.tree_util.register_dataclass
