@@ -16,7 +16,7 @@ from experiments.study import changed
 from ncs_jax import Assembly, Scene, assemble, scene_from
 from ncs_jax.assembly import track_of
 from ncs_jax.energies.collision import surface_from
-from ncs_jax.energies.proximity import groups_from
+from ncs_jax.energies.proximity import groups_from, nearby_pairs
 from ncs_jax.io.npz import write_npz
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.mesh import mesh_from
@@ -176,8 +176,14 @@ def derivatives(terms: Terms, x, along, garment, material, frame, surface):
     return value(x), slope, second
 
 
+@jax.jit
+def crowded(x, mesh, groups, thickness):
+    """Are more pairs near each other than the lists hold?"""
+    return nearby_pairs(x, mesh, groups, thickness).overflow
+
+
 def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]:
-    """Every term of the specimen, its numbers rounded to float32 first."""
+    """Every term of the specimen, its numbers rounded to float32 first; self-contact only where its lists hold all pairs."""
 
     def array(a):
         return jnp.asarray(np.asarray(a, np.float32), dtype)
@@ -195,6 +201,8 @@ def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]
         if terms.friction:
             pressed = pressure(array(s.carried), array(s.body), on, replace(ALONE, collision="plane"), own)
         groups = groups_from(mesh) if terms.self_contact else None
+        if groups is not None and crowded(array(s.three[0]), mesh, groups, own.self_thickness):
+            continue
         frame = Frame(
             array(s.dt), array(s.three[1]), array(s.three[2]), array(s.body), array(s.blended), array(s.carried), pressed
         )

@@ -251,6 +251,19 @@ def test_on_the_surface_itself(dtype):
     assert jnp.all(jnp.isfinite(on_body)) and d.dtype == dtype
 
 
+def test_single_precision_far_from_the_origin(rng):
+    """Distance and gradient of the same rounded numbers in either precision, 1 km away and a micrometre from faces."""
+    vertices, faces = bracket()
+    p, away = vertices[faces], 1000 * np.array([0.6, 0.64, 0.48])
+    for place, offset in ((away, 0.03), (0, 1e-6)):
+        x = p.mean(axis=1) + offset * rng.normal(size=(len(p), 3))
+        x, body = np.float32(x + place), np.float32(vertices + place)
+        surface = surface_from(x, body, faces)
+        one, two = (exact_distance()(jnp.asarray(x, t), jnp.asarray(body, t), surface) for t in (jnp.float32, jnp.float64))
+        np.testing.assert_allclose(one[0], two[0], atol=2e-8)
+        np.testing.assert_allclose(one[1], two[1], atol=2e-5)
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_body_with_collapsed_triangles_gives_finite_distances(dtype):
     vertices, faces = ball(1, 0.1)

@@ -394,22 +394,29 @@ def triangle_distance(
 
     The sign comes from the pseudo-normal of the feature that holds c (face, edge or vertex), which alone is right at
     edges and vertices; on the rim of a touchable part, where the body goes on unseen, everything counts as outside. The
-    closest point and n are constants to the derivative, which is exact to first order; on the surface itself n is the
-    pseudo-normal. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
+    closest point and n are constants to the derivative, which is exact to first order; on the surface itself, and wherever c
+    lies within a face, n is the pseudo-normal. Differences are formed from a corner of the triangle, so that it costs no
+    accuracy to be far from the origin. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
     """
-    corners = lax.stop_gradient(body)[surface.faces[index]]
-    weights = closest_weights(lax.stop_gradient(x), corners)
-    moving = body[surface.faces[index]]
-    closest = jnp.sum(weights[..., None] * moving, axis=1)
+    triangle = body[surface.faces[index]]
+    weights = closest_weights(lax.stop_gradient(x), lax.stop_gradient(triangle))
     normal = _pseudo_normal(lax.stop_gradient(body), surface, index, weights)
-    away = lax.stop_gradient(x - closest)
+    gap = _gap(x, triangle, weights)
+    away = lax.stop_gradient(gap)
     length = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
-    touching = length < 1e-7  # m: the rounding of a float32 position at 1 m
     side = jnp.sign(jnp.sum(away * normal, axis=-1, keepdims=True))
     rim = jnp.all(surface.border[surface.faces[index]] | (weights <= 0), axis=-1, keepdims=True)
     side = jnp.where(rim, 1, side)
-    direction = jnp.where(touching | (side == 0), normal, side * away / jnp.where(touching, 1, length))
-    return jnp.sum(direction * (x - closest), axis=-1)
+    touching = length < 1e-7  # m: the rounding of a float32 position at 1 m
+    within = jnp.all(weights > 0, axis=-1, keepdims=True) & ~rim
+    direction = jnp.where(touching | within | (side == 0), normal, side * away / jnp.where(touching, 1, length))
+    return jnp.sum(direction * gap, axis=-1)
+
+
+def _gap(x, corners, weights):
+    """x - sum_k w_k c_k (..., 3) for weights that add up to 1, as differences from the first corner."""
+    a, b, c = (corners[..., k, :] for k in range(3))
+    return x - a - weights[..., 1:2] * (b - a) - weights[..., 2:] * (c - a)
 
 
 def closest_weights(x, corners):
@@ -437,7 +444,7 @@ def closest_weights(x, corners):
     )
     zero = jnp.zeros_like(s)
     edges = jnp.stack([jnp.stack(w, axis=-1) for w in ([1 - s, s, zero], [zero, 1 - t, t], [u, zero, 1 - u])], axis=1)
-    gap = x[:, None] - jnp.einsum("vek,vkd->ved", edges, corners, precision="highest")
+    gap = _gap(x[:, None], corners[:, None], edges)
     best = jnp.argmin(jnp.sum(gap * gap, axis=-1), axis=1)
     return jnp.where(inside[:, None], face, jnp.take_along_axis(edges, best[:, None, None], axis=1)[:, 0])
 
