@@ -100,7 +100,7 @@ def tried(subject: str, axis: str, value: Any, row: Callable[[], dict]) -> dict:
 def of_energies(scene: Scene, quick: bool) -> list[dict]:
     """Every term along every axis, and in every shape."""
     s = specimen(scene)
-    none = {name: (0.0, 0.0, 0.0) for name in TERMS}
+    none = dict.fromkeys(TERMS, (0.0, 0.0, 0.0))
     usual = none | evaluated(s, list(TERMS), jnp.float64)
     cases = [(axis, value, along_axis(s, axis, value), none) for axis, values in PHYSICS.items() for value in values]
     cases += [("shape", name, shaped, usual) for name, shaped in shapes(s)]

@@ -152,6 +152,8 @@ class View:
         self._lock = threading.RLock()
         self.server = viser.ViserServer(host, port, label=what.title, verbose=False)
         self.faces = np.asarray(what.run.assembly.garment.faces)
+        # Another alpha leaves it as it is.
+        self._worn = functools.lru_cache(1)(lambda name: worn_over(what.run.assembly, what.run.motion(name)))
         self._stage()
         self._panel()
         self._load()
@@ -173,7 +175,7 @@ class View:
         self.server.initial_camera.fov = np.radians(40)
         mesh = functools.partial(scene.add_mesh_simple, side="double")
         self.cloth = mesh("/garment", rest, self.faces, color=CLOTH)
-        posed, faces = worn_over(self.what.run.assembly, self.what.run.motion(self.what.motions[0]))
+        posed, faces = self._worn(self.what.motions[0])
         self.body = None if posed is None else mesh("/body", posed[0], faces, color=SKIN)
         self.other = mesh("/overlay", rest, self.faces, color=OTHER, opacity=0.5, visible=False)
         one = np.zeros((3, 3), np.float32)
@@ -213,7 +215,7 @@ class View:
             run, name = self.what.run, self.motion.value
             self.track = run.track(name)
             self.vertices = self.what.animate(name, float(self.alpha.value))
-            self.posed, _ = worn_over(run.assembly, run.motion(name))
+            self.posed, _ = self._worn(name)
             self.fps = run.assembly.model.fps
             self.scrub.max = max(len(self.vertices) - 1, 1)
             self.frame, self._dirty = self.frame % len(self.vertices), True

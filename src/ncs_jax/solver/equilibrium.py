@@ -9,11 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ncs_jax.solver.cholesky import solve
-from ncs_jax.solver.conjugate_gradients import conjugate_gradients
+from ncs_jax.solver.minimal_residuals import minimal_residuals
 from ncs_jax.solver.minimise import Settings, Solution, minimise
 from ncs_jax.solver.problem import Problem, energy, evaluated, factored, placed
 
 __all__ = ["equilibrium"]
+
+UNSOLVED = 1e-3  # of a cotangent, that a solve leaves
 
 
 def equilibrium(
@@ -22,8 +24,9 @@ def equilibrium(
     """`minimise`, whose derivative is that of the minimum itself and not of the way to it.
 
     Where grad E(x, s) = 0, the implicit function theorem gives dx/ds = -H^-1 d(grad E)/ds with the exact Hessian H; in
-    reverse one solve with H for a cotangent, by conjugate gradients that the factored approximation of H preconditions.
-    What exact pins hold moves with them, and H is that of the rest.
+    reverse one solve with H for a cotangent, by minimal residuals that the factored approximation of H preconditions: an
+    equilibrium need not be stable. What exact pins hold moves with them, and H is that of the rest. Where the solve fails, as
+    where H is singular, the derivative is NaN.
     """
     leaves, tree = jax.tree.flatten(problem)
     smooth = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves)  # topology has no derivative
@@ -62,7 +65,9 @@ def _implicit_backward(static, kept, cotangents):
     _, hessian = jax.linearize(lambda x: balance(numbers, x)[0], x)
     factor = factored(problem, x, evaluated(problem, x))
     tolerance = 1e-6 if x.dtype == jnp.float32 else 1e-12  # nearly the rounding
-    adjoint = conjugate_gradients(hessian, lambda r: solve(problem.order, factor, r), along * free[:, None], tolerance, 1000)
+    right = along * free[:, None]
+    adjoint, left = minimal_residuals(hessian, lambda r: solve(problem.order, factor, r), right, tolerance, 1000)
+    adjoint = jnp.where(left < UNSOLVED, adjoint, jnp.nan)
     _, back = jax.vjp(lambda numbers: balance(numbers, x), numbers)
     (result,) = back((-adjoint, along))
     return result, None, None
