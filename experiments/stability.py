@@ -224,15 +224,20 @@ def of_networks(scene: Scene, quick: bool) -> list[dict]:
 # Simulator and training
 
 
-def materials(material: Material, axis: str, value: float) -> Material:
-    """At a value of one of the axes of PHYSICS that are of the material."""
-    if axis.startswith("stiffness"):
-        material = replace(material, membrane=tuple(n * n.dtype.type(value) for n in material.membrane))
-        names: tuple[str, ...] = ("bending", "collision", "pinning")
-    else:
-        names = ("gravity",) if axis.startswith("gravity") else ("density",)
-        value = value if axis.startswith("gravity") else value / float(material.density)
-    return replace(material, **{n: getattr(material, n) * getattr(material, n).dtype.type(value) for n in names})
+def materials(material: Material, axis: str, value: Any) -> Material:
+    """At a value of one of the axes of `SWEPT` that are of the material."""
+    if axis.startswith("gravity of"):
+        along = np.eye(3)["xyz".index(value[-1])] * (-1 if value.startswith("-") else 1)
+        pull = np.asarray(material.gravity)
+        return replace(material, gravity=jnp.asarray(np.linalg.norm(pull) * along, pull.dtype))
+    factor = value / float(material.density) if axis.startswith("density") else value
+    stretched = tuple(n * n.dtype.type(factor) for n in material.membrane)
+    names: tuple[str, ...] = ("bending", "collision", "pinning") if axis.startswith("stiffness") else (axis.split(",")[0],)
+    if axis.startswith(("stiffness", "membrane")):
+        material = replace(material, membrane=stretched)
+    return replace(
+        material, **{n: getattr(material, n) * getattr(material, n).dtype.type(factor) for n in names if n != "membrane"}
+    )
 
 
 def hung(folder: Path, axis: str, value: float, dtype: Any):
@@ -251,7 +256,13 @@ def simulated(simulator, track: Track, settings: Settings):
     return simulate(simulator, track, settings)
 
 
-SWEPT = {**PHYSICS, "jump within a frame, sizes": tens(-1, 4)}
+SWEPT: dict[str, tuple[Any, ...]] = {
+    **PHYSICS,
+    "membrane, times the default": tens(-6, 9),
+    "bending, times the default": tens(-6, 9),
+    "gravity of 1 g along": ("x", "-x", "y", "-y", "z", "-z"),
+    "jump within a frame, sizes": tens(-1, 4),
+}
 
 
 def simulated_apart(axis: str, value: Any, made: Callable[[Any], Any]) -> dict:
