@@ -40,3 +40,29 @@ def test_energies(tmp_path):
     for *_, slope, _, measured, _, _ in checks:
         assert float(slope) == pytest.approx(float(measured), rel=1e-2)
     assert any("finite: True" in text for text in printed) and drawn(notebook) == 1
+
+
+@pytest.mark.slow
+def test_training(tmp_path):
+    notebook, printed = ran("training", tmp_path, "steps = 20")
+    assert any("out_of_balance" in text for text in printed) and any("settling" in text for text in printed)
+    assert drawn(notebook) == 2
+
+
+@pytest.mark.slow
+def test_simulation(tmp_path):
+    notebook, printed = ran("simulation", tmp_path, "frames = 3")
+    assert any("all at tolerance: True" in text for text in printed) and any("in balance: True" in text for text in printed)
+    checks = [line.split() for text in printed for line in text.splitlines() if "by differences" in line]
+    assert len(checks) == 6
+    for line in checks:
+        assert float(line[2]) == pytest.approx(float(line[-1]), rel=1e-3)
+    assert drawn(notebook) == 1
+
+
+@pytest.mark.slow
+def test_inference(tmp_path):
+    _, printed = ran("inference", tmp_path, "steps = 10")
+    difference = next(line for text in printed for line in text.splitlines() if "largest difference" in line)
+    assert float(difference.split()[-2]) < 1e-5
+    assert any("tshirt.onnx.json" in text for text in printed)
