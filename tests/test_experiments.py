@@ -188,7 +188,7 @@ def test_falling(tmp_path, capsys):
 @pytest.mark.parametrize("name", ["a batch of 1", "a window of 1", "one triangle"])
 def test_scenes_of_the_least_size_train(tmp_path, name):
     scene = dict(specimens.least(tmp_path))[name]
-    row = stability.learned("scene", name, assemble(scene), steps=4)
+    row = stability.learned("training", "scene", name, assemble(scene), steps=4)
     assert row["dropped"] == 0 and np.isfinite(row["last"]) and row["first"] != row["last"]
 
 

@@ -47,8 +47,10 @@ def test_material_out_of_range(tmp_path, plain_jax, what):
 
 
 def test_frame_rate_out_of_range(tmp_path, plain_jax):
-    (finding,) = found(tmp_path, SCENE.replace("fps = 30", "fps = 1000"))
-    assert finding.what == "time step" and "1/1000" in finding.value
+    two = found(tmp_path, SCENE.replace("fps = 30", "fps = 1000"))
+    assert [finding.what for finding in two] == ["time step", "time step of a recurrence"] and "1/1000" in two[0].value
+    (finding,) = found(tmp_path, SCENE.replace("fps = 30", "fps = 120"))
+    assert finding.what == "time step of a recurrence" and "swing" in finding.mend
 
 
 def test_mesh_with_flaws(tmp_path, plain_jax):
