@@ -17,6 +17,7 @@ from ncs_jax.assembly import Assembly, track_of
 from ncs_jax.energies.collision import nearest_triangle, triangle_distance
 from ncs_jax.io import MotionRecord
 from ncs_jax.kinematics import blend, skin
+from ncs_jax.mesh import LINE
 from ncs_jax.model import Model, local_rotations, pose_body
 from ncs_jax.scene import Scene
 
@@ -91,11 +92,11 @@ def _mesh(a: Assembly) -> Iterator[Finding]:
     longest = edges.max(axis=1)
     slim = double / np.where(longest > 0, longest, 1) ** 2
     clean = "clean the mesh where it was made"
-    flat = int((slim == 0).sum())
+    flat = int((slim <= LINE).sum())
     if flat:
         yield Finding("triangles of no area", str(flat), "they weigh nothing and resist nothing", clean)
-    worst = float(slim[slim > 0].min(initial=1.0))
-    count = int((slim[slim > 0] < RANGES["height of a triangle"][0]).sum())
+    worst = float(slim[slim > LINE].min(initial=1.0))
+    count = int((slim[slim > LINE] < RANGES["height of a triangle"][0]).sum())
     shown = f"{worst:.1e} of its longest edge, {count} such"
     yield from _outside("height of a triangle", worst, shown, "its strain is rounding", clean)
     twice = len(x) - len(np.unique(x, axis=0))

@@ -13,7 +13,9 @@ from jaxtyping import Array, Float, Int
 from ncs_jax.numerics import least_length
 from ncs_jax.vectors import Vector, cross, dot, length, minus, plus, times
 
-__all__ = ["Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
+__all__ = ["LINE", "Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
+
+LINE = 2e-6  # a face's rest height, of its longest edge, up to which it is a line: its own positions in float32 tell no more
 
 
 @jax.tree_util.register_dataclass
@@ -38,6 +40,8 @@ class Rings:
 @dataclass(frozen=True)
 class Mesh:
     """A garment's rest state. Lengths in m, areas in m^2, angles in rad; elements of zero rest area weigh nothing.
+
+    A face up to `LINE` times as high as its longest edge is long is of zero rest area.
 
     A hinge is an edge between two faces: its vertices are the two ends, then the one opposite in each face.
     """
@@ -197,7 +201,8 @@ def mesh_from(
     u = material_axes(x, faces, uv, warp)
     v = np.cross(normal / np.maximum(2 * area, 1e-300)[:, None], u)
     shape = np.stack([[np.sum(a * b, axis=1) for b in (e1, e2)] for a in (u, v)]).transpose(2, 0, 1)
-    good = area > 1e-12 * np.maximum(np.sum(e1 * e1 + e2 * e2, axis=1), 1e-300)
+    longest = np.max([np.sum(e * e, axis=1) for e in (e1, e2, e2 - e1)], axis=0)
+    good = 2 * area > LINE * longest
     axes = np.linalg.inv(np.where(good[:, None, None], shape, np.eye(2))) * good[:, None, None]
     area = area * good
     vertex_area = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(x))
@@ -207,8 +212,7 @@ def mesh_from(
     inner = sides[:, 1] >= 0
     hinge_area = area[sides[inner]]
     with jax.enable_x64(True):
-        areas = jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))
-        angle = np.asarray(jax.jit(lambda x, i, a: dihedral(corners(x, i), [a[:, 0], a[:, 1]]))(jnp.asarray(x), hinges, areas))
+        angle = np.asarray(_rest_angles(jnp.asarray(x), hinges, jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))))
     array = lambda a: jax.device_put(np.asarray(a, dtype))  # noqa: E731, without a program for every shape
     return Mesh(
         rest=array(x),
@@ -225,6 +229,11 @@ def mesh_from(
         hinge_area=array(hinge_area),
         rings=_rings(faces, edges, hinges, sides[inner], len(x), dtype),
     )
+
+
+@jax.jit
+def _rest_angles(x, hinges, areas):
+    return dihedral(corners(x, hinges), [areas[:, 0], areas[:, 1]])
 
 
 def _rings(faces, edges, hinges, sides, verts: int, dtype) -> Rings:
