@@ -270,7 +270,7 @@ def skinned(path: Path, times, clip: int = 0) -> np.ndarray:
     skin = gltf.skins[0]
     inverse = rows_of(gltf, blob, skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     parts = []
-    for primitive in gltf.meshes[0].primitives:
+    for primitive in gltf.meshes[next(node.mesh for node in gltf.nodes if node.skin is not None)].primitives:
         a = primitive.attributes
         x = rows_of(gltf, blob, a.POSITION)
         sets = [(a.JOINTS_0, a.WEIGHTS_0)] + ([(a.JOINTS_1, a.WEIGHTS_1)] if getattr(a, "JOINTS_1", None) is not None else [])

@@ -13,8 +13,10 @@ import pytest
 
 from ncs_jax import io
 from ncs_jax.cli import main
-from ncs_jax.runs import train
+from ncs_jax.preview import posed_body
+from ncs_jax.runs import load_run, train
 
+from .characters import skinned
 from .scenes import grid, post, swing, write_scene
 
 
@@ -295,6 +297,17 @@ def test_animate_in_every_format(run_folder, tmp_path, capsys, name):
         assert io.read_animation(tmp_path / name).vertices.shape == (24, 30, 3)
     else:
         assert len(list((tmp_path / name).glob("*.obj"))) == 24
+
+
+def test_animate_with_the_body(run_folder, tmp_path, capsys):
+    _, folder = run_folder
+    assert main(["animate", str(folder), "--out", str(tmp_path / "a.glb"), "--body"]) == 0
+    run = load_run(folder)
+    theirs = skinned(tmp_path / "a.glb", np.arange(24) / run.assembly.model.fps)
+    ours = posed_body(run.assembly.body, run.motion(run.assembly.scene.motion.files[0]))
+    assert np.abs(ours - theirs).max() < 1e-5
+    assert main(["animate", str(folder), "--out", str(tmp_path / "a.usdc"), "--body"]) == 2
+    one_line(capsys, ["a.usdc", ".glb", "body"])
 
 
 def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ncs_jax.io import usd
 from ncs_jax.io.glb import write_glb
 from ncs_jax.io.normals import vertex_normals
 
+from . import characters
 from .shapes import tube
 
 USD = ["usd", "usdc", "usda", "usdz"]
@@ -183,6 +185,48 @@ def test_glb_of_one_frame_and_of_many_vertices(tmp_path):
     assert "targets" not in glb.primitive and "animations" not in glb.json and x.shape[1] > 2**16
     np.testing.assert_array_equal(glb.accessor(glb.primitive["attributes"]["POSITION"]), x[0])
     np.testing.assert_array_equal(glb.accessor(glb.primitive["indices"]).reshape(-1, 3), faces)
+
+
+@pytest.mark.parametrize("rest_axes", [True, False])
+def test_glb_with_the_body_that_wears_it(tmp_path, rest_axes):
+    """As the specification skins it, and as the reader of characters takes it up again."""
+    hero = characters.write_glb(tmp_path / "hero.glb")
+    body, motion = io.read_body(hero), io.read_motion(hero)
+    if not rest_axes:
+        body = replace(body, rest_rotations=np.tile(np.eye(3), (3, 1, 1)), joint_names=())
+    x, faces, _ = walk(frames=len(motion.poses))
+    shown = body if rest_axes else replace(body, rest_rotations=None)
+    io.write_animation(tmp_path / "a.glb", x, faces, motion.fps, worn_by=(shown, motion))
+    ours = characters.posed(body, motion)
+    theirs = characters.skinned(tmp_path / "a.glb", np.arange(len(x)) / motion.fps)
+    assert np.ptp(ours, axis=0).max() > 0.1 and np.abs(ours - theirs).max() < 2e-6
+    again, moved = io.read_body(tmp_path / "a.glb"), io.read_motion(tmp_path / "a.glb")
+    assert again.joint_names == (body.joint_names or ("joint_0", "joint_1", "joint_2"))
+    np.testing.assert_allclose(characters.posed(again, moved)[:, :, 1].max(axis=1), ours[:, :, 1].max(axis=1), atol=1e-5)
+
+
+def test_a_body_of_many_joints_keeps_the_eight_that_count_most(tmp_path, rng):
+    rest, faces = tube(8, 4)
+    weights = rng.random((len(rest), 12)) ** 4
+    weights /= weights.sum(axis=1, keepdims=True)
+    joints = np.stack([np.zeros(12), np.linspace(0, 1, 12), np.zeros(12)], axis=1)
+    body = io.BodyRecord(rest, faces, joints, np.arange(-1, 11), weights)
+    motion = io.MotionRecord(0.2 * rng.standard_normal((2, 12, 3)), np.zeros((2, 3)), 30.0)
+    io.write_animation(tmp_path / "a.glb", np.zeros((2, 3, 3)), [[0, 1, 2]], 30, worn_by=(body, motion))
+    theirs = characters.skinned(tmp_path / "a.glb", [0, 1 / 30])
+    least = np.sort(weights, axis=1)[:, -8, None]
+    kept = np.where(weights >= least, weights, 0)
+    kept /= kept.sum(axis=1, keepdims=True)
+    ours = characters.posed(replace(body, weights=kept, rest_rotations=np.tile(np.eye(3), (12, 1, 1))), motion)
+    assert np.abs(ours - theirs).max() < 2e-6
+
+
+def test_no_other_format_holds_a_body(tmp_path):
+    hero = characters.write_glb(tmp_path / "hero.glb")
+    worn_by = io.read_body(hero), io.read_motion(hero)
+    with pytest.raises(InputError, match=r"a\.npz: \.glb expected"):
+        io.write_animation(tmp_path / "a.npz", np.zeros((13, 3, 3)), [[0, 1, 2]], 30, worn_by=worn_by)
+    assert not (tmp_path / "a.npz").exists()
 
 
 def test_a_glb_that_its_format_cannot_hold(tmp_path):

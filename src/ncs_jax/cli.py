@@ -90,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     animate.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
     animate.add_argument("--out", required=True, metavar="FILE", help=FORMATS)
+    animate.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
 
     export = command("export", _export, "write one step of a trained garment for a host that has neither JAX nor this package")
     export.add_argument("folder", metavar="RUN", help="folder that ncs train made")
@@ -326,6 +327,11 @@ def _animate(options) -> int:
     motions = (options.motion,) if options.motion else reports.motions_of(run.assembly.scene)
     if not motions:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+    worn_by = None
+    if options.body:
+        if run.assembly.body is None:
+            raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
+        worn_by = run.assembly.body, run.motion(motions[0])
     vertices, error = run.animate(motions[0], options.alpha), ""
     if options.rank or options.bfloat16:
         smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
@@ -333,10 +339,9 @@ def _animate(options) -> int:
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     garment = run.assembly.garment
-    io.write_animation(options.out, vertices, garment.faces, run.assembly.model.fps, rest=garment.vertices)
-    print(
-        f"{options.out}: {len(vertices)} frames at {run.assembly.model.fps:g} per second, {vertices.shape[1]} vertices{error}"
-    )
+    fps = run.assembly.model.fps
+    io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, worn_by=worn_by)
+    print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
     return 0
 
 

@@ -16,7 +16,7 @@ from ncs_jax.io.mdd import read_mdd, write_mdd
 from ncs_jax.io.npz import read_npz, write_npz
 from ncs_jax.io.obj import format_obj
 from ncs_jax.io.pc2 import read_pc2, write_pc2
-from ncs_jax.io.records import AnimationRecord
+from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.table import floats, indices
 from ncs_jax.io.usd import USD, read_usd_animation, write_usd
 
@@ -28,7 +28,13 @@ FORMATS = (*READABLE, ".glb")
 
 
 def write_animation(
-    path: str | Path, vertices: ArrayLike, faces: ArrayLike, fps: float | int, *, rest: ArrayLike | None = None
+    path: str | Path,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    fps: float | int,
+    *,
+    rest: ArrayLike | None = None,
+    worn_by: tuple[BodyRecord, MotionRecord] | None = None,
 ) -> None:
     """Write a moving mesh; the suffix says how, and the file or folder appears whole or not at all.
 
@@ -39,15 +45,19 @@ def write_animation(
 
     Args:
         path: where to. Missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
-        rest: (V, 3) m, the shape at rest, for USD; else that of the first frame.
+        rest: (V, 3) m, the shape at rest, for USD; else that of the first frame. worn_by: the body and its motion of T frames,
+            to go into a .glb too.
 
     Raises:
-        InputError: the suffix is unknown, the arrays do not fit together or are not finite, or the place cannot be written to.
+        InputError: the suffix is unknown, or holds no body, the arrays do not fit together or are not finite, or the place
+            cannot be written to.
     """
     file = Path(path)
     suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
     if suffix and suffix not in FORMATS:
         raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+    if worn_by is not None and suffix != ".glb":
+        raise InputError(".glb expected, as no other format here holds a body", file=file, value=suffix or "a folder")
     x = floats(file, "vertices", np.asarray(vertices), ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
     triangles = indices(file, "faces", np.asarray(faces), ("F", 3), x.shape[1], "vertices")
     if 0 in x.shape:
@@ -63,7 +73,7 @@ def write_animation(
     elif suffix == ".mdd":
         write_mdd(file, x, float(fps))
     elif suffix == ".glb":
-        write_glb(file, x, triangles, float(fps))
+        write_glb(file, x, triangles, float(fps), worn_by)
     elif suffix in USD:
         given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
         write_usd(file, x, triangles, float(fps), given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["about_axis", "from_matrix", "multiply", "slerp", "to_axis_angle", "to_matrix"]
+__all__ = ["about_axis", "from_axis_angle", "from_matrix", "multiply", "slerp", "to_axis_angle", "to_matrix"]
 
 
 def about_axis(axis: int, angle: np.ndarray) -> np.ndarray:
@@ -12,6 +12,13 @@ def about_axis(axis: int, angle: np.ndarray) -> np.ndarray:
     q = np.zeros((*np.shape(angle), 4))
     q[..., 0], q[..., axis + 1] = np.cos(angle / 2), np.sin(angle / 2)
     return q
+
+
+def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) of axis times angle (..., 3), rad."""
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    half = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle / 2) / angle
+    return np.concatenate([np.cos(angle / 2), half * vectors], axis=-1)
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
