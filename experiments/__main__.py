@@ -4,7 +4,7 @@
 
 Writes OUT/README.md and its tables and pictures in OUT/results. What has been simulated and trained is kept in `--kept`, where
 a study that was interrupted goes on; a fresh one starts from an empty folder. `--page` writes the page anew from the tables
-that are there.
+that are there. Tables of another run in OUT/results/repeated are held beside them.
 """
 
 from __future__ import annotations
@@ -118,6 +118,54 @@ By how much the choice that is nearest to the simulation differs from the one th
 """
 
 
+# A quantity of the tables, and how a difference of it is told.
+REPEATED = {
+    "total": ("energy, %", "{:.2f}"),
+    "dynamic_share": ("dynamic share", "{:.3f}"),
+    "hem_correlation": ("hem correlation", "{:.3f}"),
+    "distance": ("mm to simulation", "{:.2f}"),
+    "stopped_share": ("after a stop", "{:.2f}"),
+    "settling": ("settling, s", "{:.2f}"),
+}
+
+
+def repeated(results: Path) -> str:
+    """How far the same study came out elsewhere, whose tables lie in the folder `repeated`; empty where there is none."""
+    other = results / "repeated"
+    if not other.is_dir():
+        return ""
+    lines = []
+    for name, section in SECTIONS.items():
+        if section.module is falling:
+            continue
+        both_rows = zip(rows_of(results, name), rows_of(other, name), strict=True)
+        pairs = [(a, b) for a, b in both_rows if spread.RANGE not in a.values()]
+        cells = [section.title]
+        for key, (_, told) in REPEATED.items():
+            both = [(a[k], b[k]) for a, b in pairs for k in (key, f"unseen_{key}") if k in a and k in b]
+            apart = [abs(a - b) * (100 / abs(a) if key == "total" else 1) for a, b in both]
+            cells.append(told.format(max(apart)) if apart else "")
+        lines.append(f"| {' | '.join(cells)} |")
+    table = "\n".join(lines)
+    here, there = (
+        next(
+            row["distance"] for row in rows_of(folder, "falling") if (row["case"], row["inertia"]) == ("pendulum", "constants")
+        )
+        for folder in (results, other)
+    )
+    return f"""## Repeated on another processor
+
+One machine gives every number again, but for the times, to the last digit. One with other instructions rounds differently, and
+a training or a simulation that rounds differently goes its own way: so far apart is the row of each section that is farthest.
+The simulation's own settling is among these, and whatever is measured beside it moves with it. The pendulum is {here:.0f} mm
+from its simulation here, and {there:.0f} there.
+
+| {" | ".join(["section", *(label for label, _ in REPEATED.values())])} |
+{"|---" * (1 + len(REPEATED))}|
+{table}
+"""
+
+
 def page(results: Path) -> str:
     """The whole page, from the tables."""
     (facts,) = rows_of(results, "study")
@@ -131,7 +179,8 @@ which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps wher
 control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
 seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them.
 """
-    return "\n".join([head, mattered(results), *(written(results, name) for name in SECTIONS)])
+    parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
+    return "\n".join(filter(None, parts))
 
 
 def study(steps: int, falls: int, results: Path, kept: Path) -> None:
