@@ -1,6 +1,6 @@
 """The study: every experiment, and the page that has all their tables and pictures.
 
-    python -m experiments [--steps 700] [--quick] [--page] [--out experiments] [--kept runs/study]
+    python -m experiments [--steps 600] [--quick] [--page] [--out experiments] [--kept runs/study]
 
 Writes OUT/README.md and its tables and pictures in OUT/results. What has been simulated and trained is kept in `--kept`, where
 a study that was interrupted goes on; a fresh one starts from an empty folder. `--page` writes the page anew from the tables
@@ -21,7 +21,7 @@ from experiments import architecture, augmentation, budget, control, descriptors
 from experiments.study import BALANCE, KEPT, STAND, UNSEEN, keep_programs, standing, stem
 from ncs_jax import InputError, load_scene
 
-STEPS = 700
+STEPS = 600
 LONG = 5  # times as many steps for the methods side by side, and for motion control
 FALLS = 10_000
 
@@ -177,7 +177,8 @@ Every claim of the method as an experiment on the packaged garments. All tables 
 {" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact, of
 which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps where methods stand side by side and for motion
 control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
-seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them.
+seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them, and but for the
+methods side by side, whose networks are trained one after another, that is a second network.
 """
     parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
     return "\n".join(filter(None, parts))

@@ -24,7 +24,7 @@ from jaxtyping import Array
 
 from experiments.study import (
     COLUMNS,
-    apart,
+    abreast,
     axes_of,
     changed,
     command,
@@ -184,7 +184,8 @@ def measured(scene: Scene, network: str | Callable, unseen: Sequence[str], steps
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
-    rows = [{"network": name, **apart(measured, scene, f, unseen, steps, kept)} for name, f in ARCHITECTURES.items()]
+    found = abreast([(measured, scene, network, unseen, steps, kept) for network in ARCHITECTURES.values()])
+    rows = [{"network": name, **row} for name, row in zip(ARCHITECTURES, found, strict=True)]
     left = {row["network"]: row.pop("left") for row in rows}
     write(out, "architecture", rows, {"network": "", **MEASURED})
     with axes_of(out / "architecture.png", 1, (5.0, 3.6)) as (axes,):

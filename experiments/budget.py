@@ -16,7 +16,7 @@ from pathlib import Path
 
 from experiments.study import (
     COLUMNS,
-    apart,
+    abreast,
     bars,
     changed,
     command,
@@ -55,8 +55,8 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     # the last ones, which move most
     scenes |= {f"{n} of {len(files)} motions": changed(scene, motion={"files": files[-n:]}) for n in counts}
     rows = networks(scenes, unseen, steps, kept, "change")
-    for fps in RATES:
-        rows += apart(used, changed(scene, motion={"fps": fps}), unseen[0], steps, kept)
+    for found in abreast([(used, changed(scene, motion={"fps": fps}), unseen[0], steps, kept) for fps in RATES]):
+        rows += found
     write(out, "budget", rows, {"change": "", **COLUMNS})
     bars(out / "budget.png", rows, "change", {key: COLUMNS[key] for key in ("dynamic_share", "distance", "minutes")})
     return rows

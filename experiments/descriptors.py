@@ -19,7 +19,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.study import apart, bars, changed, command, fitted, judged, recurrent, reference, trained, without, write
+from experiments.study import abreast, bars, changed, command, fitted, judged, recurrent, reference, trained, without, write
 from ncs_jax import Run, Scene, local_rotations
 from ncs_jax.descriptors import DESCRIPTORS
 from ncs_jax.methods.ncs import NCS
@@ -96,10 +96,10 @@ def measured(scene: Scene, unseen: str, steps: int, kept: Path, blind: bool) -> 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = recurrent(without(scene, unseen))
-    rows = []
-    for name, blind in (*((name, False) for name in DESCRIPTORS), ("six", True)):
-        row = apart(measured, changed(scene, network={"descriptor": name}), unseen[0], steps, kept, blind)
-        rows.append({"descriptor": f"{name}, gravity not seen" if blind else name, **row})
+    cases = {name: (name, False) for name in DESCRIPTORS} | {"six, gravity not seen": ("six", True)}
+    scenes = [(changed(scene, network={"descriptor": name}), blind) for name, blind in cases.values()]
+    found = abreast([(measured, one, unseen[0], steps, kept, blind) for one, blind in scenes])
+    rows = [{"descriptor": name, **row} for name, row in zip(cases, found, strict=True)]
     write(out, "descriptors", rows, COLUMNS)
     bars(
         out / "descriptors.png",

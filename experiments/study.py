@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import fcntl
 import hashlib
 import json
 import multiprocessing
@@ -12,10 +13,11 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import jax
@@ -99,6 +101,15 @@ def named(*told: Any) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
+@contextmanager
+def one_at_a_time(file: Path) -> Iterator[None]:
+    """Another process that wants to make the same file waits here, and then finds it made."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
     """The scene's garment simulated over a motion, (frames, verts, 3) in m: made once, and read from the folder after that.
 
@@ -108,9 +119,9 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
     tables = smooth.to_dict()
     told = [motion, scene.motion.fps, *(tables[name] for name in ("body", "garment", "physics", "simulation"))]
     file = kept / "simulations" / f"{named(told)}.npz"
-    if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_npz(file, vertices=simulate(smooth, motion).vertices)
+    with one_at_a_time(file):
+        if not file.exists():
+            write_npz(file, vertices=simulate(smooth, motion).vertices)
     with np.load(file, allow_pickle=False) as arrays:
         return arrays["vertices"]
 
@@ -118,7 +129,8 @@ def reference(scene: Scene, motion: str, kept: Path) -> np.ndarray:
 def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
     """The scene's network after so many steps, and how many minutes they took: trained once, and read after that."""
     folder = kept / "trained" / named(scene.to_dict(), steps)
-    run = train(scene, folder, steps=steps, resume=(folder / "run.json").exists())
+    with one_at_a_time(folder):
+        run = train(scene, folder, steps=steps, resume=(folder / "run.json").exists())
     with (folder / "log.csv").open(newline="") as file:
         seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
     return run, seconds[-1] / 60
@@ -139,18 +151,24 @@ def fitted(scene: Scene, altered: Callable[[Any, Track], Method], steps: int) ->
     return Run(a, params, steps), (time.monotonic() - began) / 60
 
 
-def judged(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
-    """Every quantity, and every measure of motion beside the simulation, of an animation of a run's garment."""
+def moving(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
+    """Every measure of motion beside the simulation of an animation of a run's garment."""
     model, track = run.assembly.model, run.track(motion)
-    found = summarise(measure(model, vertices, track)) | dynamics(model, vertices, track)
-    return found | compare(model, vertices, simulated, track)
+    return dynamics(model, vertices, track) | compare(model, vertices, simulated, track)
+
+
+def judged(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
+    """The same and every quantity."""
+    found = summarise(measure(run.assembly.model, vertices, run.track(motion)))
+    return found | moving(run, motion, vertices, simulated)
 
 
 def judged_on(run: Run, motions: Sequence[str], animations: Sequence[np.ndarray], kept: Path) -> dict[str, float]:
     """The same on several motions: what the first has nothing to say of, such as a stop, is from the next."""
     found: dict[str, float] = {}
     for motion, vertices in zip(motions, animations, strict=True):
-        found = judged(run, motion, vertices, reference(run.assembly.scene, motion, kept)) | found
+        how = moving if found else judged
+        found = how(run, motion, vertices, reference(run.assembly.scene, motion, kept)) | found
     return found
 
 
@@ -161,8 +179,9 @@ def network(scene: Scene, motions: Sequence[str], steps: int, kept: Path) -> dic
 
 
 def networks(scenes: dict[str, Scene], motions: Sequence[str], steps: int, kept: Path, what: str = "network") -> list[dict]:
-    """The same of several scenes, each in a process of its own: a row each, named by its key."""
-    return [{what: name, **apart(network, scene, motions, steps, kept)} for name, scene in scenes.items()]
+    """The same of several scenes, two at a time: a row each, named by its key."""
+    found = abreast([(network, scene, motions, steps, kept) for scene in scenes.values()])
+    return [{what: name, **row} for name, row in zip(scenes, found, strict=True)]
 
 
 def keep_programs(kept: Path) -> None:
@@ -175,6 +194,33 @@ def apart(job: Callable, *arguments: Any) -> Any:
     """What a function of a module returns, from a process of its own: its memory and its programs are gone afterwards."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as alone:
         return alone.submit(job, *arguments).result()
+
+
+def abreast(jobs: Sequence[Sequence[Any]]) -> list:
+    """What the jobs (function, *arguments) return, two at a time, each in a process and on a half of the cores of its own.
+
+    Much of what a network takes, compiling above all, keeps but one core busy.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    halves: SimpleQueue = SimpleQueue()
+    for half in (cores[::2], cores[1::2]):
+        halves.put(half or cores)
+
+    def one(job):
+        half = halves.get()
+        try:
+            return apart(on_cores, half, *job)
+        finally:
+            halves.put(half)
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(one, jobs))
+
+
+def on_cores(cores: Sequence[int], job: Callable, *arguments: Any) -> Any:
+    """What a function returns, of a process that keeps to these cores."""
+    os.sched_setaffinity(0, cores)
+    return job(*arguments)
 
 
 def write(out: Path, name: str, rows: Sequence[dict], columns: dict[str, str]) -> None:

@@ -1,6 +1,7 @@
 """Experiments at their smallest size."""
 
 import csv
+import os
 from pathlib import Path
 
 import numpy as np
@@ -80,8 +81,16 @@ def test_speed_accuracy(tmp_path, capsys):
 @pytest.fixture
 def alone(monkeypatch):
     """Everything in this process: starting others takes longer than what they do here."""
-    for module in (study, architecture, budget, control, descriptors, methods):
+    for module in (control, methods):
         monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
+    for module in (study, architecture, budget, descriptors):
+        monkeypatch.setattr(module, "abreast", lambda jobs: [job(*arguments) for job, *arguments in jobs])
+
+
+def test_two_jobs_run_on_cores_of_their_own():
+    cores = os.sched_getaffinity(0)
+    first, second = study.abreast([(os.sched_getaffinity, 0)] * 2)
+    assert first | second == cores and (len(cores) == 1 or not first & second)
 
 
 def studied(module, tmp_path, *more, text=SCENE):
@@ -113,7 +122,7 @@ def test_methods(alone, tmp_path):
     assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")
     # the motion stops: a pose without motion stands at once
     assert float(rows["pbns"]["stopped_share"]) == 0 < float(rows["snug"]["stopped_share"])
-    assert len(list((tmp_path / "kept" / "simulations").iterdir())) == 1
+    assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == 1
 
 
 @pytest.mark.slow

@@ -159,7 +159,7 @@ class NetworkSpec:
     dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints; snug's encoder", low=1, high=65536)
     cell: str = _f("gated", "what ncs remembers by, see the README", choices=("gated", "linear", "swing"))
     vibrations: int = _f(12, "the garment's vibrations that a swing is made of", low=1, high=256)
-    damping: float = _f(0.6, "of a swing, 1/s", low=0, high=1e6)
+    damping: float = _f(0.3, "of a swing, 1/s", low=0, high=1e6)
     decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
     modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
 
