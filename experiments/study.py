@@ -264,14 +264,19 @@ def command(name: str, doc: str | None, experiment: Callable, arguments: Sequenc
 
 
 @contextmanager
-def axes_of(path: Path, count: int, size: tuple[float, float] = (4.0, 3.6)) -> Iterator[Any]:
-    """So many axes beside each other, saved as a PNG."""
+def axes_of(path: Path, count: int, size: tuple[float, float] = (4.0, 3.6), across: int | None = None) -> Iterator[Any]:
+    """So many axes, all beside each other or so many across, saved as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(1 + count * size[0], size[1]), dpi=130, layout="constrained")
+    across = min(count, across or count)
+    down = -(-count // across)
+    figure = Figure(figsize=(1 + across * size[0], down * size[1]), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
-    every = figure.subplots(1, count, squeeze=False)[0]
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    for empty in every[count:]:
+        empty.remove()
+    every = every[:count]
     yield every
     for axes in every:
         axes.grid(alpha=0.3)
