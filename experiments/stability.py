@@ -8,8 +8,8 @@ where they are smaller than of the garment as worn, which at rest has none, as a
 simulator the vertices, the simulator's to one tolerance in both. It is `safe` up to a thousandth, `at risk` above it, `broken`
 where a number is not finite, `refused` where a scene is not accepted, or more pairs are in self-contact than its lists hold.
 Training has nothing to be compared with: it is safe where no step is dropped and the energy falls. Limbs that leap have no one
-answer: the simulator is safe where it finds its balance to 0.1 g. Writes stability_PART.csv, .md and .png of every part. Half
-an hour on two cores.
+answer: the simulator is safe where it finds its balance to 0.1 g. Writes stability_PART.csv of all cells, .md and .png of every
+part. Half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.specimens import TERMS, along_axis, evaluated, hanging, least, limbs, shapes, specimen
-from experiments.study import axes_of, changed, write
+from experiments.study import axes_of, changed, write_csv, write_markdown
 from ncs_jax import InputError, Scene, assemble, load_scene, train
 from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
@@ -460,10 +460,9 @@ def experiment(scene: Scene, out: Path, *, only: Sequence[str] = (), quick: bool
                 continue
             rows = part(scene, quick)
             jax.clear_caches()  # a process may hold only so many pieces of memory, and every program is several
-            write(out, f"stability_{name}_cells", rows, {"subject": "", "axis": "", "value": "", "error": "", "state": ""})
-            write(
-                out, f"stability_{name}", ranges(rows), {"subject": "", "axis": "", **{s: s for s in STATES}, "worst": "worst"}
-            )
+            write_csv(out / f"stability_{name}.csv", rows)
+            headings = {"subject": "", "axis": "", **{s: s for s in STATES}, "worst": "worst"}
+            write_markdown(out / f"stability_{name}.md", ranges(rows), headings)
             draw(out / f"stability_{name}.png", rows)
             found[name] = rows
     return found

@@ -223,23 +223,31 @@ def on_cores(cores: Sequence[int], job: Callable, *arguments: Any) -> Any:
     return job(*arguments)
 
 
-def write(out: Path, name: str, rows: Sequence[dict], columns: dict[str, str]) -> None:
-    """All of the rows as NAME.csv, and some columns {key: heading} of them as a Markdown table NAME.md."""
-    out.mkdir(parents=True, exist_ok=True)
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    with (out / f"{name}.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, keys)
+def write_csv(file: Path, rows: Sequence[dict]) -> None:
+    """All of the rows."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w", newline="") as opened:
+        table = csv.DictWriter(opened, list(dict.fromkeys(key for row in rows for key in row)))
         table.writeheader()
         table.writerows(rows)
+
+
+def write_markdown(file: Path, rows: Sequence[dict], columns: dict[str, str]) -> None:
+    """Some columns {key: heading} of the rows."""
 
     def shown(value: Any) -> str:
         return f"{value:.3g}" if isinstance(value, float) else str(value)
 
     columns = {key: heading for key, heading in columns.items() if any(key in row for row in rows)}
-
     lines = ["| " + " | ".join(columns.values()) + " |", "|---" * len(columns) + "|"]
     lines += ["| " + " | ".join(shown(row.get(key, "")) for key in columns) + " |" for row in rows]
-    (out / f"{name}.md").write_text("\n".join(lines) + "\n")
+    file.write_text("\n".join(lines) + "\n")
+
+
+def write(out: Path, name: str, rows: Sequence[dict], columns: dict[str, str]) -> None:
+    """All of the rows as NAME.csv, and some columns {key: heading} of them as a Markdown table NAME.md."""
+    write_csv(out / f"{name}.csv", rows)
+    write_markdown(out / f"{name}.md", rows, columns)
 
 
 def command(name: str, doc: str | None, experiment: Callable, arguments: Sequence[str] | None = None) -> int:

@@ -212,7 +212,7 @@ def test_scenes_that_are_none_are_refused(tmp_path):
 def test_stability(tmp_path, capsys):
     assert stability.main([str(write_scene(tmp_path)), "--quick", "--out", str(tmp_path / "out")]) == 0
     for part in stability.PARTS:
-        with (tmp_path / "out" / f"stability_{part}_cells.csv").open() as file:
+        with (tmp_path / "out" / f"stability_{part}.csv").open() as file:
             rows = list(csv.DictReader(file))
         assert {row["state"] for row in rows} <= set(stability.STATES) and any(row["state"] == "safe" for row in rows)
         assert (tmp_path / "out" / f"stability_{part}.png").read_bytes()[:4] == b"\x89PNG"
