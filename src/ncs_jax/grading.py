@@ -26,7 +26,7 @@ __all__ = ["RANGES", "Finding", "findings"]
 # quantity: (least, most) that is safe
 RANGES = {
     "time step": (1 / 240, 1 / 5),  # s
-    "time step of a recurrence": (1 / 60, 1 / 5),
+    "time step of a recurrence": (1 / 15, 1 / 5),
     "density": (0.01, 10.0),  # kg/m^2
     "stiffness": (1e-3, 1e4),  # times the default
     "gravity": (0.0, 100 * 9.81),  # m/s^2
@@ -66,7 +66,7 @@ def _material(scene: Scene) -> Iterator[Finding]:
     if scene.network.method == "ncs" and scene.network.cell != "swing" and physics.inertia:
         yield from _outside(
             "time step of a recurrence", 1 / fps, f"1/{fps:g} s", "inertia against its own past feeds on itself",
-            'network.cell = "swing", or motion.fps up to 60: what it learned may be used at any frame rate',
+            'network.cell = "swing", or motion.fps up to 15: what it learned may be used at any frame rate',
         )  # fmt: skip
     yield from _outside("density", physics.density, f"{physics.density:g} kg/m^2", rounding, "physics.density")
     pull = float(np.linalg.norm(physics.gravity))
