@@ -80,6 +80,16 @@ def test_a_partial_file_of_another_simulation_is_refused(scene, tmp_path, monkey
     assert partial.read_bytes() == before
 
 
+def test_double_precision_balances_cloth_that_is_stiff_for_its_weight(tmp_path):
+    stiff = SMOOTH + "[physics]\ndensity = 0.01\n[physics.membrane]\nlam = 418.0\nmu = 222.0\n"
+    single, double = (
+        simulate(write_scene(tmp_path, f'{stiff}[simulation]\nprecision = "{name}"\n')) for name in ("single", "double")
+    )
+    assert np.any(single.status != CONVERGED) and single.residual.max() > 0.1
+    assert np.all(double.status == CONVERGED) and double.residual.max() <= 0.001
+    assert double.vertices.dtype == np.float64
+
+
 def test_substeps_keep_the_frames(scene, unbroken, tmp_path):
     fine = simulate(write_scene(tmp_path, SMOOTH + "[simulation]\nsubsteps = 2\n"))
     assert fine.vertices.shape == unbroken.vertices.shape

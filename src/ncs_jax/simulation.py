@@ -64,20 +64,26 @@ def simulate(
     motion: str | None = None,
     *,
     partial: str | Path | None = None,
-    dtype=jnp.float32,
     report: Callable[[Progress], None] | None = None,
 ) -> Trajectory:
     """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
 
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
-            first. partial: a file that keeps what is done while it runs and is continued from where it exists. dtype: float64
-            needs JAX's x64 mode. report: called after every frame.
+            first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
+            after every frame.
 
     Raises:
         InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
     """
     scene = load_scene(scene) if isinstance(scene, str | Path) else scene
+    if scene.simulation.precision == "single":
+        return _simulated(scene, motion, jnp.float32, partial, report)
+    with jax.enable_x64(True):
+        return _simulated(scene, motion, jnp.float64, partial, report)
+
+
+def _simulated(scene: Scene, motion: str | None, dtype, partial: str | Path | None, report) -> Trajectory:
     spec = scene.simulation
     named = (*scene.motion.files, *scene.motion.validation)
     name = motion or (named[0] if named else None)
@@ -100,7 +106,7 @@ def simulate(
     simulator = simulator_from(model)
     state = stepper(simulator, settings).init()
     frames = 1 + (len(matrices) - 1) // spec.substeps
-    identity = json.dumps([scene.to_dict(), name, frames, jnp.dtype(dtype).name], sort_keys=True)
+    identity = json.dumps([scene.to_dict(), name, frames], sort_keys=True)
     done: dict[str, np.ndarray] = {
         "vertices": np.zeros((0, *model.garment.mesh.rest.shape), jnp.dtype(dtype)),
         "iterations": np.zeros(0, np.int64),
