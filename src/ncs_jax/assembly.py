@@ -347,15 +347,15 @@ def _model(scene, prepared: Prepared, body, garment, mesh, pins, under, dtype) -
 
 def _vibrating(scene: Scene, prepared: Prepared, model: Model, faces, track: Track | None) -> Prepared:
     """With the garment's vibrations: found with smooth contact, as a simulation converges with no other."""
-    from ncs_jax.vibration import LEAST, softest
+    from ncs_jax.vibration import softest
 
     if faces is not None:
         model = replace(model, terms=replace(model.terms, collision="smooth"), surface=_surface(model, faces, track, True))
     found = softest(model, track, scene.network.vibrations)
     if found is None:
         raise InputError(
-            f"a garment that hangs on something, and swings within {1 / LEAST:g} s, expected", file=scene.source,
-            field="network.cell", value="swing", mend="pin it, put it on a body, or choose the gated or the linear cell",
+            "a garment that hangs on something, and swings, expected", file=scene.source, field="network.cell", value="swing",
+            mend="pin it, put it on a body, or choose the gated or the linear cell",
         )  # fmt: skip
     return replace(prepared, vibrations=np.asarray(found.directions), energy=np.asarray(found.energy))
 

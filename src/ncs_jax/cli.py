@@ -378,17 +378,16 @@ def _simulate(options) -> int:
     io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
+    precision = "double" if result.vertices.dtype == np.float64 else "single"
     print(
         f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g, "
-        f"median {np.median(result.seconds):.3g} s"
+        f"median {np.median(result.seconds):.3g} s, {precision} precision"
     )
     for status, text in ((1, "out of iterations"), (2, "no step lowers the energy further"), (3, "not finite")):
         frames = np.flatnonzero(result.status == status)
         if frames.size:
             worst = result.residual[frames].max()
             print(f"  {frames.size} frames not at tolerance: {text} (first: frame {frames[0]}, worst {worst:.3g} g)")
-    if result.status.any() and result.vertices.dtype == np.float32:
-        print('  where cloth is stiff for its weight, rounding leaves that much: simulation.precision = "double"')
     return 0
 
 

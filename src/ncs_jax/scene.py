@@ -183,8 +183,8 @@ class SimulationSpec:
     """[simulation]: how `ncs simulate` solves a frame."""
 
     solver: str = _f("newton", "newton for accuracy, quasi_newton for speed", choices=("newton", "quasi_newton"))
-    precision: str = _f("single", "double: balance where cloth is stiff for its weight", choices=("single", "double"))
-    tolerance: float = _f(0.0, "out-of-balance acceleration, g; 0: 0.1, and 0.001 in double precision", low=0, high=1e6)
+    tolerance: float = _f(0.1, "out-of-balance acceleration, g", low=1e-9, high=1e6)
+    precision: str = _f("auto", "auto: double where single cannot reach the tolerance", choices=("auto", "single", "double"))
     iterations: int = _f(100, "most iterations a step", low=1, high=1_000_000)
     substeps: int = _f(1, "steps a frame", low=1, high=1000)
     pins: str = _f("springs", "what holds the pins", choices=("springs", "exact"))

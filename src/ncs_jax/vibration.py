@@ -12,7 +12,7 @@ from ncs_jax.kinematics import blend, skin
 from ncs_jax.model import Model, Vibrations, pose_body
 from ncs_jax.modes import modal_basis
 from ncs_jax.motion import Track
-from ncs_jax.solver.problem import STATIC, Problem, blocks, descended, evaluated, imbalance, knowing, look
+from ncs_jax.solver.problem import TALL, Problem, blocks, descended, evaluated, imbalance, knowing, look, static_step
 from ncs_jax.solver.stiffness import couplings_from
 
 __all__ = ["softest"]
@@ -20,7 +20,7 @@ __all__ = ["softest"]
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
 STEPS = 200  # of Newton's method to the drape
 ENOUGH = {np.dtype(np.float32): 0.3, np.dtype(np.float64): 0.01}  # m/s^2: the acceleration that may be left there
-LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing
+LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
 def _still(model: Model, track: Track) -> Problem:
@@ -111,14 +111,14 @@ def softest(model: Model, track: Track, count: int) -> Vibrations | None:
     problem, diagonal, off = _drape(_still(model, track))
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
-    added = mass / max(1 / model.fps, STATIC) ** 2  # by `blocks`
+    added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
     stiff, masses = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3)), diags(np.repeat(mass, 3))
     held = np.asarray(model.garment.pins) if model.terms.pinning else ()
     rest, area = (np.asarray(a, np.float64) for a in (mesh.rest, mesh.vertex_area))
     smooth = modal_basis(rest, np.asarray(mesh.faces), area, -(-count // 3), held=held)
     if not smooth.size:
         return None
-    least = (2 * np.pi * LEAST) ** 2
+    least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
     u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
     squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
     if squares[0] < least:

@@ -22,11 +22,13 @@ from ncs_jax.solver.cholesky import Elimination, factorise
 from ncs_jax.solver.contact import Contact, touching
 from ncs_jax.solver.stiffness import Couplings, stiffness
 
-__all__ = ["STATIC", "Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored",
-           "imbalance", "knowing", "look", "looked", "placed", "reach", "touched", "trusted", "unhindered"]  # fmt: skip
+__all__ = ["TALL", "Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored",
+           "imbalance", "knowing", "look", "looked", "placed", "reach", "static_step", "touched", "trusted",
+           "unhindered"]  # fmt: skip
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
-STATIC = 1 / 30  # s: the time step that damps the way to a static state, where the frame's own is shorter
+STATIC = 1 / 30  # s: the time step that damps the way to a static state, where the frame's own is shorter,
+TALL = 2.0  # m: of garments up to this size; beyond, it grows with the root of the size, as a pendulum's period
 LEAST_STEP = 1e-6  # of a step: below it the line search gives up
 REACH = 2  # how far the search for self-contact looks, in thicknesses of the cloth
 
@@ -166,6 +168,12 @@ def evaluated(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
     return Point(value, gradient, contact, found)
 
 
+def static_step(model: Model) -> Float[Array, ""]:
+    """The time step that damps the way to a static state, s."""
+    size = jnp.max(jnp.ptp(model.garment.mesh.rest, axis=0))
+    return STATIC * jnp.sqrt(jnp.maximum(1, size / TALL))
+
+
 def imbalance(problem: Problem, gradient: Float[Array, "verts 3"]) -> Float[Array, "verts"]:
     """Squared out-of-balance forces over mass; none where there is no mass."""
     mass = problem.mass
@@ -181,7 +189,7 @@ def blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
     diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, problem.frame, terms, touching)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state, however short a frame.
     mass, dt = problem.mass, problem.frame.dt
-    dt = jnp.where(problem.moving > 0, dt, jnp.maximum(dt, STATIC))
+    dt = jnp.where(problem.moving > 0, dt, jnp.maximum(dt, static_step(model)))
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / dt**2
     if problem.pinned is not None:
         off = jnp.where(jnp.all(problem.free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
