@@ -18,7 +18,20 @@ from pathlib import Path
 import numpy as np
 
 from experiments.speed_accuracy import streamed
-from experiments.study import COLUMNS, apart, changed, command, judged_on, recurrent, reference, stem, trained, without, write
+from experiments.study import (
+    COLUMNS,
+    abreast,
+    apart,
+    changed,
+    command,
+    judged_on,
+    recurrent,
+    reference,
+    stem,
+    trained,
+    without,
+    write,
+)
 from ncs_jax import Run, Scene, assemble
 from ncs_jax.dynamics import stops
 
@@ -47,6 +60,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     scenes = {method: changed(scene, network={"method": method}) for method in METHODS}
     if scene.network.cell == "swing":
         scenes[RECURRENT] = recurrent(scenes["ncs"])
+    abreast([(reference, scene, motion, kept) for motion in unseen])
     made = [apart(simulated, scene, unseen, kept)]
     made += [apart(learned, method, one, unseen, steps, kept) for method, one in scenes.items()]
     rows = [row for row, _ in made]

@@ -439,7 +439,8 @@ def draw(path: Path, rows: Sequence[dict]) -> None:
     every = list(dict.fromkeys(r["axis"] for r in rows))
     most, longest = len({r["subject"] for r in rows}), max(len(shown(r["value"])) for r in rows)
     labelled = most < 4  # on every panel; else on the left ones
-    with axes_of(path, len(every), (4.6 if labelled else 3.6, 1.2 + 0.25 * most + 0.08 * longest), across=4) as panels:
+    across = 4 if len(every) > 4 else 2
+    with axes_of(path, len(every), (4.6 if labelled else 3.6, 1.2 + 0.25 * most + 0.08 * longest), across=across) as panels:
         for place, (axes, axis) in enumerate(zip(panels, every, strict=True)):
             own = [r for r in rows if r["axis"] == axis]
             subjects, values = (list(dict.fromkeys(r[key] for r in own)) for key in ("subject", "value"))
@@ -451,10 +452,11 @@ def draw(path: Path, rows: Sequence[dict]) -> None:
             for i, j in np.argwhere(np.isinf(table)):
                 axes.fill([j - 0.5, j + 0.5, j + 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5], color="black")
             axes.set_xticks(range(len(values)), [*map(shown, values)], rotation=90, fontsize=7)
-            axes.set_yticks(range(len(subjects)), subjects if labelled or place % 4 == 0 else [""] * len(subjects), fontsize=8)
+            names = subjects if labelled or place % across == 0 else [""] * len(subjects)
+            axes.set_yticks(range(len(subjects)), names, fontsize=8)
             axes.set_title(axis, fontsize=9)
-        label = "float32 from float64, share; white: refused, black: broken"
-        axes.figure.colorbar(image, ax=list(panels), label=label, fraction=0.03, aspect=40)
+        bar = axes.figure.colorbar(image, ax=list(panels), fraction=0.03, aspect=40)
+        bar.set_label("error, a share\nwhite: refused, black: broken", fontsize=8)
 
 
 def experiment(scene: Scene, out: Path, *, only: Sequence[str] = (), quick: bool = False) -> dict[str, list[dict]]:
