@@ -177,8 +177,8 @@ Every claim of the method as an experiment on the packaged garments. All tables 
 {" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact, of
 which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps where methods stand side by side and for motion
 control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
-seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them, and but for the
-methods side by side, whose networks are trained one after another, that is a second network.
+seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them, such as a
+second network trained beside; milliseconds of a frame are of one network alone.
 """
     parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
     return "\n".join(filter(None, parts))
