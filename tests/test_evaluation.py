@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from ncs_jax.assembly import assemble, track_of
+from ncs_jax.energies.collision import surface_from
 from ncs_jax.energies.proximity import groups_from, intersecting
-from ncs_jax.evaluation import BLOCK, measure, summarise
+from ncs_jax.evaluation import BLOCK, _depth, measure, summarise, winding_number
 from ncs_jax.scene import load_scene, scene_from
 
 from .scenes import write_scene
+from .shapes import ball, tube
 
 
 def assembled(folder, **physics):
@@ -76,6 +78,37 @@ def test_skin_between_vertices(assembly):
     rows = measure(model, x[None].repeat(2, axis=0), still(model, 2))
     assert rows["depth_max"][0] == 0 and 1.5 < rows["middle_depth_max"][0] <= 2
     assert summarise(rows)["middle_depth_max"] == rows["middle_depth_max"].max()
+
+
+def test_the_winding_number_is_one_within_a_closed_surface_and_what_is_left_of_it_within_an_open_one(rng):
+    vertices, faces = ball(3, 0.1)
+    away = rng.normal(size=(20, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    triangles = jnp.asarray(vertices[faces])
+    np.testing.assert_allclose(winding_number(jnp.asarray(0.09 * away), triangles), 1, atol=1e-6)
+    np.testing.assert_allclose(winding_number(jnp.asarray(0.11 * away), triangles), 0, atol=1e-6)
+    half = vertices[faces].mean(axis=1) @ [0.1, 0.7, 0.2] > 0  # of a surface that is the same seen from the other side
+    np.testing.assert_allclose(winding_number(jnp.zeros((1, 3)), triangles[half]), 0.5, atol=1e-6)
+
+
+def test_a_crease_of_a_garment_below_that_is_folded_too_far_does_not_turn_outside_into_inside():
+    """A sleeve with a ridge whose flanks pass through each other: what is 2 cm before its tip is not inside."""
+    around, rings, tip = 24, 14, 6
+    x, faces = tube(around, rings, 0.1, 0.5)
+    x, angle = x.reshape(rings, around, 3), 2 * np.pi / around
+    x[:, tip] *= [1.3, 1, 1.3]
+    for side in (-1, 1):  # each flank's foot past the other's
+        turned = angle * tip - side * np.radians(0.5)
+        x[:, tip + side, [0, 2]] = 0.1 * np.array([np.sin(turned), np.cos(turned)])
+    body = jnp.asarray(x.reshape(-1, 3), jnp.float32)
+    out = np.array([np.sin(angle * tip), 0, np.cos(angle * tip)])
+    points = np.array([0.15 * out, -0.105 * out, -0.095 * out, [0, 0, 0]]) + [0, 0.24, 0]
+    surface = surface_from(points, np.asarray(body), faces)
+    single, layered = (np.asarray(_depth(jnp.asarray(points, jnp.float32), body, surface, worn)) for worn in (False, True))
+    assert single[0] > 0.015, "by the pseudo-normal alone it is inside"
+    np.testing.assert_allclose(layered[0], -single[0], rtol=1e-6)
+    np.testing.assert_allclose(layered[1:], single[1:])
+    assert layered[1] < 0 < layered[2] < layered[3]
 
 
 def test_a_free_fall_is_in_balance(tmp_path):

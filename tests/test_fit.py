@@ -65,6 +65,27 @@ def test_units_axes_and_place_are_found(body, scale, up):
     np.testing.assert_allclose(placed.vertices - placed.vertices.mean(0), given.vertices - given.vertices.mean(0), atol=1e-6)
 
 
+def wide_skirt():
+    """In centimetres and Z up, on the packaged body, and wider than its box by more than a tenth of its size."""
+    x, faces = tube(32, 12, 0.17, 0.5)
+    wide = 1 + 0.9 * (0.5 - x[:, 1:2]) / 0.5
+    x = x * np.where([True, False, True], wide, 1) + [0, 0.53, 0.03]
+    return x, io.GarmentRecord(100 * x @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), faces)
+
+
+def test_a_wide_skirt_in_place_stays_there():
+    """It is not a collar, X up, though as that it would be nearer to the body."""
+    x, given = wide_skirt()
+    placed, moved = place("g.obj", given, io.read_body(ASSETS / "body.npz"))
+    assert (placed.scale, placed.up) == (0.01, "z") and not moved.any()
+    np.testing.assert_allclose(placed.vertices, x, atol=1e-6)
+
+
+def test_what_cannot_be_pushed_out_is_refused():
+    with pytest.raises(InputError, match=r"g\.npz: vertices: .*pushed out of the body.*X up.* m out.*--up"):
+        fit("g.npz", wide_skirt()[1], io.read_body(ASSETS / "body.npz"), scale=0.01, up="x")
+
+
 def test_a_garment_of_no_size_is_refused(body):
     with pytest.raises(InputError, match=r"g\.obj: vertices: a garment about the size of the body.*--scale"):
         place("g.obj", io.GarmentRecord(1e7 * sleeve().vertices, sleeve().faces), body)

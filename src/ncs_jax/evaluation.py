@@ -40,6 +40,39 @@ QUANTITIES = {
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
 
+DEEPEST = 64  # points of a frame that are asked a second time whether they are inside
+
+
+def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3 3"]) -> Float[Array, "points"]:
+    """How many times a surface encloses each point: 1 within a closed one, 0 outside; where it is open, by how much.
+
+    The sum of the triangles' solid angles, w = sum_f 2 atan2(a . (b x c), |a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|) /
+    (4 pi), with a, b, c from the point to the corners. Sources: van Oosterom and Strackee 1983; Jacobson et al. 2013.
+    """
+    a, b, c = (triangles[None, :, k] - x[:, None] for k in range(3))
+
+    def dot(u, v):
+        return jnp.sum(u * v, axis=-1)
+
+    la, lb, lc = norm(a), norm(b), norm(c)
+    below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+    return jnp.sum(jnp.arctan2(dot(a, jnp.cross(b, c)), below), axis=-1) / (2 * np.pi)
+
+
+def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
+    """How deep points are inside, m, by exact point-triangle distance.
+
+    Of a garment worn below, `layered`, a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
+    points inward. The deepest points are therefore asked a second time: only what it also encloses is inside.
+    """
+    index, _ = nearest_triangle(x, body, surface)
+    depth = -triangle_distance(x, body, surface, index)
+    if not layered:
+        return depth
+    deepest, at = lax.top_k(depth, min(DEEPEST, len(depth)))
+    inside = winding_number(x[at], body[surface.faces]) > 0.5
+    return depth.at[at].set(jnp.where(inside, deepest, -jnp.abs(deepest)))
+
 
 def _frame(
     model: Model, exact: bool, groups: Groups | None, middles: Surface | None, x, previous, before, matrices, matrices_before
@@ -82,16 +115,15 @@ def _frame(
     }
     if model.surface is not None:
         if exact:
-            index, _ = nearest_triangle(x, body, model.surface)
-            depth = -triangle_distance(x, body, model.surface, index)
+            depth = _depth(x, body, model.surface, bool(model.under))
         else:
             depth = -distances(x, body, model.surface, terms)
         result["penetrating"] = 100 * jnp.mean(depth > 0)
         result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
         if middles is not None:
             between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
-            index, _ = nearest_triangle(between, body, middles)
-            result["middle_depth_max"] = 1000 * jnp.maximum(jnp.max(-triangle_distance(between, body, middles, index)), 0)
+            deepest = jnp.max(_depth(between, body, middles, bool(model.under)))
+            result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
     if groups is not None:
         through, overflow = intersecting(x, mesh, groups)
         result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))

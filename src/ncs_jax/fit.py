@@ -24,6 +24,7 @@ __all__ = ["PINS", "Fitted", "fit", "pins_of", "place", "push_out", "spread_weig
 
 PINS = "pins"
 TURNS_OUT, RINGS = 200, 6
+STAYS = 1.5  # times as ill as anywhere else a garment may fit and is not moved
 NEAR = 0.05  # m from the body within which it carries cloth
 LYING, SMOOTH, LEAST = 0.02, 0.03, 1e-6  # m, m, and what cloth that lies nowhere is trusted
 ALIKE = 0.5  # cosine between the normals of cloth and body that face each other
@@ -65,11 +66,18 @@ def fit(
         scale, up: metres a unit of the file and the axis that is up in it, where they are known; else found out.
 
     Raises:
-        InputError: no unit, no axes and no place make it lie on the body.
+        InputError: no unit, no axes and no place make it lie on the body, or it cannot be pushed out of it.
     """
     placed, moved = place(file, garment, body, scale=scale, up=up)
     before = placed.vertices
     x = push_out(before, placed.faces, body, clearance)
+    farthest = float(np.linalg.norm(x - before, axis=1).max())
+    if farthest > FAR * np.ptp(body.vertices, axis=0).max():
+        raise InputError(
+            f"a garment that can be pushed out of the body expected, as placed with {placed.scale:g} m a unit and "
+            f"{placed.up.upper()} up", file=file, field="vertices", value=f"{farthest:.2f} m out",
+            mend="bring it onto the body by hand, or say its unit and axis with --scale and --up",
+        )  # fmt: skip
     surface = surface_from(x, body.vertices, body.faces)
     placed = replace(placed, vertices=x)
     depth = tuple(-_distances(at, body, surface)[0] for at in (before, x))
@@ -94,12 +102,12 @@ def place(
     Raises:
         InputError: in no unit has it the size of something worn.
     """
-    found = list(_candidates(garment, body, scale, up))
+    found = list(_candidates(garment, body, scale, up, 5)) or list(_candidates(garment, body, scale, up, 10))
     there = [c for c in found if stray(c.vertices, body.vertices) <= FAR]
     if there:
         return there[0], np.zeros(3)
     if found:
-        _, way, best = min(((*_settled(c.vertices, body), c) for c in found), key=lambda t: t[0])
+        _, way, best = min(((*_settled(c, body), c) for c in found), key=lambda t: t[0])
         return replace(best, vertices=best.vertices + way.astype(best.vertices.dtype)), way
     raise InputError(
         "a garment about the size of the body expected, in any unit", file=file, field="vertices",
@@ -107,8 +115,13 @@ def place(
     )  # fmt: skip
 
 
-def _candidates(garment: GarmentRecord, body: BodyRecord, scale: float | None, up: str | None) -> Iterator[GarmentRecord]:
-    """In every unit and with every axis up in which it has the size of something worn, as given first."""
+def _candidates(
+    garment: GarmentRecord, body: BodyRecord, scale: float | None, up: str | None, least: float
+) -> Iterator[GarmentRecord]:
+    """In every unit and with every axis up in which it has the size of something worn, as given first.
+
+    In another unit than that it has at least the body's size by `least`: a skirt in inches fits an arm in centimetres.
+    """
     units = (scale,) if scale else dict.fromkeys((garment.scale, *UNITS))
     axes = (up,) if up else dict.fromkeys((garment.up, "y", "z", "x"))
     raw = garment.vertices / garment.scale @ TURNS[garment.up].T
@@ -117,31 +130,38 @@ def _candidates(garment: GarmentRecord, body: BodyRecord, scale: float | None, u
         for axis in axes:
             x = upright(raw, unit, axis).astype(garment.vertices.dtype)
             given = unit == garment.scale and axis == garment.up
-            if tall / (30 if given else 10) <= np.ptp(x, axis=0).max() <= 1.1 * tall:
+            if tall / (30 if given else least) <= np.ptp(x, axis=0).max() <= 1.1 * tall:
                 yield replace(garment, vertices=x, scale=unit, up=axis)
 
 
-def _settled(x: np.ndarray, body: BodyRecord) -> tuple[float, np.ndarray]:
-    """How ill a shape fits the body where it fits it best, m, and how far it is moved to there."""
+def _settled(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.ndarray]:
+    """How ill a garment fits the body where it fits it best, m, and how far it is moved to there, if at all.
+
+    That is how far it is from the skin, five times as much within it, over how much the two face alike: a ring around chest and
+    back may be near them, and faces elsewhere.
+    """
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
     tree, normals = cKDTree(body.vertices), vertex_normals(body.vertices, body.faces)
-    some = x[:: max(1, len(x) // 800)]
+    some = slice(None, None, max(1, len(garment.vertices) // 800))
+    x, facing = garment.vertices[some], vertex_normals(garment.vertices, garment.faces)[some]
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
     trunk = np.median(body.vertices, axis=0)
 
     def ill(way: np.ndarray) -> float:
-        away, index = tree.query(some + way)
-        side = np.sum((some + way - body.vertices[index]) * normals[index], axis=1)
-        return float(np.mean(np.where(side < 0, 5 * away, away)))
+        away, index = tree.query(x + way)
+        side = np.sum((x + way - body.vertices[index]) * normals[index], axis=1)
+        alike = abs(np.mean(np.sum(facing * normals[index], axis=1)))  # of one that faces inward, too
+        return float(np.mean(np.where(side < 0, 5 * away, away)) / max(alike, 0.05))
 
     middle = (x.min(axis=0) + x.max(axis=0)) / 2
     heights = np.linspace(low[1], high[1], 25)
-    starts = [np.array([trunk[0], y, trunk[2]]) - middle for y in heights]
+    starts = [np.zeros(3), *(np.array([trunk[0], y, trunk[2]]) - middle for y in heights)]
     first = min(starts, key=ill)
     best = minimize(ill, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 200})
-    return float(best.fun), np.asarray(best.x)
+    stays = ill(np.zeros(3))
+    return (stays, np.zeros(3)) if stays <= STAYS * best.fun else (float(best.fun), np.asarray(best.x))
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
@@ -179,6 +199,7 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
     surface = surface_from(with_middles(x, edges), body.vertices, body.faces)
     rest, held, own = x.astype(np.float64), np.zeros(len(x), bool), np.zeros(x.shape)
+    far = FAR * np.ptp(body.vertices, axis=0).max()  # beyond which it is not being pushed out of anything
     for _ in range(TURNS_OUT):
         moved = own
         for _ in range(RINGS):
@@ -187,7 +208,7 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
         lacks = np.maximum(clearance - distance, 0)
         short, away = lacks[: len(x)].copy(), away[: len(x)]
         np.maximum.at(short, edges, lacks[len(x) :, None])
-        if short.max() <= 0.01 * clearance:
+        if short.max() <= 0.01 * clearance or np.linalg.norm(moved, axis=1).max() > far:
             break
         held |= short > 0
         own = np.where(held[:, None], moved + short[:, None] * away, 0)
