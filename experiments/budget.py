@@ -55,7 +55,9 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     # the last ones, which move most
     scenes |= {f"{n} of {len(files)} motions": changed(scene, motion={"files": files[-n:]}) for n in counts}
     rows = networks(scenes, unseen, steps, kept, "change")
-    for found in abreast([(used, changed(scene, motion={"fps": fps}), unseen[0], steps, kept) for fps in RATES]):
+    at = {fps: changed(scene, motion={"fps": fps}) for fps in RATES}
+    abreast([(reference, at[fps], unseen[0], kept) for fps in sorted(RATES, reverse=True)])
+    for found in abreast([(used, at[fps], unseen[0], steps, kept) for fps in RATES]):
         rows += found
     write(out, "budget", rows, {"change": "", **COLUMNS})
     bars(out / "budget.png", rows, "change", {key: COLUMNS[key] for key in ("dynamic_share", "distance", "minutes")})
