@@ -22,8 +22,9 @@ from ncs_jax.kinematics import blend, skin, unpose
 from ncs_jax.mesh import corners
 from ncs_jax.model import Model, pose_body
 from ncs_jax.motion import Track
-from ncs_jax.numerics import angle_between, norm
+from ncs_jax.numerics import angle_between, arctan2, norm
 from ncs_jax.objective import Frame, distances, energies, pressure
+from ncs_jax.vectors import cross, dot, length
 
 __all__ = ["QUANTITIES", "measure", "summarise"]
 
@@ -49,14 +50,10 @@ def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3
     The sum of the triangles' solid angles, w = sum_f 2 atan2(a . (b x c), |a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|) /
     (4 pi), with a, b, c from the point to the corners. Sources: van Oosterom and Strackee 1983; Jacobson et al. 2013.
     """
-    a, b, c = (triangles[None, :, k] - x[:, None] for k in range(3))
-
-    def dot(u, v):
-        return jnp.sum(u * v, axis=-1)
-
-    la, lb, lc = norm(a), norm(b), norm(c)
+    a, b, c = ([triangles[None, :, k, i] - x[:, None, i] for i in range(3)] for k in range(3))
+    la, lb, lc = map(length, (a, b, c))
     below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-    return jnp.sum(jnp.arctan2(dot(a, jnp.cross(b, c)), below), axis=-1) / (2 * np.pi)
+    return jnp.sum(arctan2(dot(a, cross(b, c)), below), axis=-1) / (2 * np.pi)
 
 
 def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
