@@ -86,14 +86,14 @@ def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -
     from ncs_jax.preview import worn_over
 
     a = run.assembly
-    body, faces = worn_over(a, run.motion(motion))
+    body, faces, worn = worn_over(a, run.motion(motion))
     end = max((first + round(a.model.fps) for first, _ in stops(run.track(motion), a.model)), default=None)
     body = None if body is None else body[:end]
     sheets = []
     with tempfile.TemporaryDirectory() as folder:
         for method, vertices in animations.items():
             file = Path(folder) / "sheet.png"
-            contact_sheet(file, vertices[:end], a.garment.faces, body, faces, a.model.fps, tile=260)
+            contact_sheet(file, vertices[:end], a.garment.faces, body, faces, a.model.fps, tile=260, worn=worn)
             with Image.open(file) as drawn:
                 sheets.append((method, drawn.convert("RGB")))
     strip = Image.new("RGB", (max(s.width for _, s in sheets), sum(s.height for _, s in sheets)), PAPER)

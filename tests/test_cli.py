@@ -329,6 +329,24 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     one_line(capsys, ["--scene"])
 
 
+def test_evaluate_of_all_motions_tells_the_deepest_of_them(run_folder, tmp_path, monkeypatch, capsys):
+    _, folder = run_folder
+    np.savez(tmp_path / "nods.npz", **swing(size=3.0))
+    motions = (*load_run(folder).assembly.scene.motion.files, str(tmp_path / "nods.npz"))
+    monkeypatch.setattr("ncs_jax.reports.motions_of", lambda scene: motions)
+    assert main(["evaluate", str(folder)]) == 0
+    told, quantity = {}, ""
+    for line in capsys.readouterr().out.splitlines():
+        if line.startswith("  "):
+            told[quantity].append(float(line.split()[-1]))
+        else:
+            told[quantity := line.split()[0].rstrip(",")] = []
+    *each, every = told["depth_max"]
+    assert every == max(each) > min(each)
+    *each, every = told["strain_mean"]
+    assert every == pytest.approx(np.mean(each), rel=1e-3)
+
+
 def test_evaluate_beside_a_reference(run_folder, tmp_path, capsys):
     _, folder = run_folder
     assert main(["animate", str(folder), "--out", str(tmp_path / "a.npz")]) == 0

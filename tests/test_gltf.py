@@ -17,6 +17,7 @@ from ncs_jax import io
 from ncs_jax.assembly import load_motion
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
+from ncs_jax.live import view
 from ncs_jax.scene import scene_from
 from tests import fbx_files
 from tests.characters import JOINTS, NAMES, figure, posed, rigid, skinned, write_glb
@@ -318,6 +319,9 @@ def test_a_scene_whose_body_and_motion_are_one_file(tmp_path, plain_jax, name):
     spine = whole[:, np.abs(whole[0, :, 1] - 0.5).argmin()]  # the sleeve stays where the figure's middle goes
     assert np.linalg.norm(made.vertices.mean(axis=1) - spine, axis=1).max() < 0.25
     assert np.linalg.norm(np.ptp(made.vertices.mean(axis=1), axis=0)) > 0.1
+    window = view(str(tmp_path / "run"), port=0)
+    window.close()
+    np.testing.assert_allclose(window.vertices, made.vertices, atol=1e-5)
 
 
 def posed_in_float32(path: Path, frames: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from ncs_jax import InputError, Run, assemble, load_run, load_scene, measure, si
 from ncs_jax.cli import main
 from ncs_jax.energies.collision import nearest_vertex, plane_distance, vertex_normals
 from ncs_jax.model import pose_body
+from ncs_jax.preview import worn_over
 
 from .scenes import SCENE, write_scene
 from .shapes import tube
@@ -53,6 +54,16 @@ def test_what_collides_is_the_body_and_the_garment_below_where_it_is(folder, wor
     assert model.surface.faces.max() == bodies.shape[1] - 1
     own = np.asarray(below.assembly.garment.faces)
     np.testing.assert_array_equal(np.asarray(model.surface.faces)[-len(own) :] - len(model.body), own)
+
+
+def test_what_is_drawn_below_is_the_body_and_then_the_garments(folder, worn):
+    (motion,) = worn.motions.values()
+    x, below = load_run(folder / "run").animate(str(folder / "swing.npz")), worn.model.under[0].model.garment.mesh
+    vertices, faces, count = worn_over(worn, motion)
+    assert count == x.shape[1] and vertices.shape[1] == len(worn.body.vertices) + count
+    np.testing.assert_allclose(vertices[:, -count:], x, atol=1e-6)
+    np.testing.assert_array_equal(faces[: len(worn.body.faces)], worn.body.faces)
+    np.testing.assert_array_equal(faces[len(worn.body.faces) :], np.asarray(below.faces) + len(worn.body.vertices))
 
 
 def test_skin_that_is_covered_does_not_collide(worn):

@@ -191,6 +191,16 @@ def test_contact_sheet(tmp_path, swing):
     assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 2
 
 
+def test_a_garment_worn_below_is_blue(tmp_path, swing):
+    def blue(worn):
+        pictures.contact_sheet(tmp_path / "a.png", **swing, frames=2, tile=120, worn=worn)
+        r, _, b = np.moveaxis(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int), 2, 0)
+        return (b > r + 10).sum()
+
+    verts = swing["body"].shape[1]
+    assert blue(0) == 0 and 0 < blue(verts // 2) < blue(verts)
+
+
 def test_contact_sheet_turns_with_the_character(tmp_path, swing):
     """A character that has turned by 90 degrees is seen from its front all the same."""
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)

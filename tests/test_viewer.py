@@ -242,6 +242,14 @@ def test_a_browser_draws_it(tmp_path, scene):
     assert np.abs(seen["0"][5, 320] - (247, 245, 241)).max() <= 1
     bare = screenshot(tmp_path, page, "frame=6&azimuth=0&paused&alpha=0&body=0")
     assert cloth_coloured(bare).sum() > 1500 and np.abs(bare - seen["0"]).max() > 60
+    verts = scene["body"].shape[1]
+    blue = {}
+    for worn in (0, verts // 2, verts):  # of whose last faces the page makes garments
+        own = scene["body_faces"][np.argsort(scene["body_faces"].max(axis=1), kind="stable")]
+        written(tmp_path, scene, facts={}, body_faces=own, worn=worn)
+        r, _, b = np.moveaxis(screenshot(tmp_path, page, "frame=6&azimuth=0&paused&alpha=0")[:360], 2, 0)
+        blue[worn] = (b > r + 10).sum()
+    assert blue[0] == 0 and 0 < blue[verts // 2] < blue[verts]
 
 
 @pytest.mark.slow

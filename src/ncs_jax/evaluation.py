@@ -190,5 +190,5 @@ def measure(
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
-    """Means over the frames; the largest for `depth_max` and `middle_depth_max`, the median for `out_of_balance`."""
+    """Means over frames or motions; the largest for `depth_max` and `middle_depth_max`, the median for `out_of_balance`."""
     return {name: float(_SUMMARY.get(name, np.mean)(values)) for name, values in rows.items()}

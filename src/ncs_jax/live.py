@@ -28,7 +28,7 @@ from ncs_jax.scene import load_scene
 
 __all__ = ["COLOURS", "Shown", "View", "colour_bins", "shown", "view"]
 
-CLOTH, SKIN, OTHER = (221, 91, 49), (176, 168, 160), (70, 130, 180)
+CLOTH, SKIN, WORN, OTHER = (221, 91, 49), (176, 168, 160), (128, 153, 178), (70, 130, 180)
 BINS = 16  # colours of a scale
 # What a colour can measure: its unit and the value at the scale's end.
 COLOURS = {
@@ -175,8 +175,14 @@ class View:
         self.server.initial_camera.fov = np.radians(40)
         mesh = functools.partial(scene.add_mesh_simple, side="double")
         self.cloth = mesh("/garment", rest, self.faces, color=CLOTH)
-        posed, faces = self._worn(self.what.motions[0])
-        self.body = None if posed is None else mesh("/body", posed[0], faces, color=SKIN)
+        posed, faces, worn = self._worn(self.what.motions[0])
+        self.below = []  # the body and the garments below: their vertices, and what shows them
+        if posed is not None:
+            bare = posed.shape[1] - worn
+            for name, first, end, colour in (("/body", 0, bare, SKIN), ("/worn", bare, bare + worn, WORN)):
+                own = faces[(first <= faces[:, 0]) & (faces[:, 0] < end)] - first
+                if len(own):
+                    self.below.append((slice(first, end), mesh(name, posed[0, first:end], own, color=colour)))
         self.other = mesh("/overlay", rest, self.faces, color=OTHER, opacity=0.5, visible=False)
         one = np.zeros((3, 3), np.float32)
         self.bins = [
@@ -193,7 +199,7 @@ class View:
         self.alpha = gui.add_slider("alpha", 0.0, 3.0, 0.05, 1.0, disabled=not what.controlled)
         self.colour = gui.add_dropdown("colour", ("cloth", *COLOURS), initial_value="cloth")
         self.overlay = gui.add_dropdown("overlay", ("none", *self.overlays), initial_value="none", visible=bool(self.overlays))
-        self.with_body = gui.add_checkbox("body", self.body is not None, disabled=self.body is None)
+        self.with_body = gui.add_checkbox("body", bool(self.below), disabled=not self.below)
         self.follow = gui.add_checkbox("keep in the middle", True)
         self.told = gui.add_markdown("")
         anew: tuple[Any, ...] = (self.motion, self.alpha)
@@ -215,7 +221,7 @@ class View:
             run, name = self.what.run, self.motion.value
             self.track = run.track(name)
             self.vertices = self.what.animate(name, float(self.alpha.value))
-            self.posed, _ = self._worn(name)
+            self.posed, *_ = self._worn(name)
             self.fps = run.assembly.model.fps
             self.scrub.max = max(len(self.vertices) - 1, 1)
             self.frame, self._dirty = self.frame % len(self.vertices), True
@@ -229,9 +235,9 @@ class View:
                 middle[[0, 2]] = x.mean(axis=0)[[0, 2]]
             other = self.overlays.get(self.overlay.value)
             other = other if other is not None and len(other) == len(self.vertices) else None
-            if self.body is not None:
-                self.body.visible = bool(self.with_body.value)
-                self.body.vertices = self.posed[frame] - middle
+            for part, shown in self.below:
+                shown.visible = bool(self.with_body.value)
+                shown.vertices = self.posed[frame, part] - middle
             self.other.visible = other is not None
             if other is not None:
                 self.other.vertices = other[frame] - middle

@@ -27,7 +27,7 @@ VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
 """Azimuth of a named view in degrees, turning from +Z, which characters face, towards +X."""
 
 CLOTH, CLOTH_INSIDE = (0.90, 0.47, 0.33), (0.55, 0.25, 0.28)
-BODY = (0.80, 0.765, 0.73)
+BODY, WORN = (0.80, 0.765, 0.73), (0.50, 0.60, 0.70)
 INK, FAINT = (46, 42, 40), (142, 135, 128)
 
 
@@ -57,6 +57,7 @@ class _Stage:
     garment_faces: np.ndarray
     body: np.ndarray | None
     body_faces: np.ndarray | None
+    worn: int
     path: np.ndarray
     half: np.ndarray
     floor: float
@@ -64,7 +65,8 @@ class _Stage:
     def meshes(self, frame: int) -> list[Mesh]:
         drawn = [Mesh(self.garment[frame], self.garment_faces, CLOTH, CLOTH_INSIDE)]
         if self.body is not None and self.body_faces is not None:
-            drawn.append(Mesh(self.body[frame], self.body_faces, BODY))
+            x = self.body[frame]
+            drawn.append(Mesh(x, self.body_faces, np.repeat([BODY, WORN], [len(x) - self.worn, self.worn], axis=0)))
         return drawn
 
     def ground(self, frame: int, radius: float) -> Ground:
@@ -104,7 +106,7 @@ def _sane(vertices):
     return np.abs(np.where(np.isfinite(vertices), vertices, np.inf)) < 1e3
 
 
-def _stage(garment, garment_faces, body, body_faces, fps, up):
+def _stage(garment, garment_faces, body, body_faces, fps, up, worn=0):
     """Check and turn an animation, and find the camera's path."""
     garment = _sequence(garment, "garment", up)
     if body is not None:
@@ -126,7 +128,7 @@ def _stage(garment, garment_faces, body, body_faces, fps, up):
     path = path + np.array([0.0, middle, 0.0])
     half = np.maximum((relative_high - relative_low) / 2, 0.05)
     half[[0, 2]] = np.maximum(np.abs(relative_low), np.abs(relative_high))[[0, 2]]
-    return _Stage(garment, garment_faces, body, body_faces, path, half, float(low[:, 1].min()))
+    return _Stage(garment, garment_faces, body, body_faces, worn, path, half, float(low[:, 1].min()))
 
 
 def _sequence(vertices, name, up):
@@ -174,15 +176,17 @@ def contact_sheet(
     up: Sequence[float] = (0.0, 1.0, 0.0),
     tile: int = 520,
     labels: Sequence[str] = (),
+    worn: int = 0,
 ) -> None:
     """Write a PNG of several moments of an animation, from the character's front and side; the camera turns with it.
 
     Args:
         path: of the PNG. garment: vertices (T, V, 3) in m. garment_faces: (F, 3). body: vertices (T, B, 3) in m, or None.
         body_faces: its faces, or None. fps: frames per second. frames: how many moments, evenly spread. up: the world's up.
-        tile: height of one picture in pixels. labels: of the moments; without them the time of each.
+        tile: height of one picture in pixels. labels: of the moments; without them the time of each. worn: how many of the
+        body's vertices, the last, are of garments worn below.
     """
-    stage = _stage(garment, garment_faces, body, body_faces, fps, up)
+    stage = _stage(garment, garment_faces, body, body_faces, fps, up, worn)
     chosen = np.unique(np.linspace(0, len(stage.garment) - 1, max(1, frames)).round().astype(int)).tolist()
     turns = [stage.heading(frame) for frame in chosen]
     shots = [[stage.frame_up(frame, turn + VIEWS[view]) for frame, turn in zip(chosen, turns, strict=True)] for view in _ROWS]
@@ -224,15 +228,16 @@ def animation_gif(
     up: Sequence[float] = (0.0, 1.0, 0.0),
     view: str = "three-quarter",
     max_bytes: int = 6_000_000,
+    worn: int = 0,
 ) -> None:
     """Write an animated GIF that follows the character over a fixed grid, at 15 frames per second or what comes closest.
 
     Args:
-        path: of the GIF. garment, garment_faces, body, body_faces, fps, up: see `contact_sheet`. max_frames: of the GIF; a
-        longer animation is cut there. size: width and height in pixels. view: one of `VIEWS`. max_bytes: colours and then
+        path: of the GIF. garment, garment_faces, body, body_faces, fps, up, worn: see `contact_sheet`. max_frames: of the GIF;
+        a longer animation is cut there. size: width and height in pixels. view: one of `VIEWS`. max_bytes: colours and then
         frames are dropped until it is no larger.
     """
-    stage = _stage(garment, garment_faces, body, body_faces, fps, up)
+    stage = _stage(garment, garment_faces, body, body_faces, fps, up, worn)
     stride = max(1, math.floor(fps / 15 + 0.5))
     chosen = np.arange(0, len(stage.garment), stride)[: max(1, max_frames)]
     half = math.hypot(stage.half[0], stage.half[2]) if view not in ("front", "back") else stage.half[0]

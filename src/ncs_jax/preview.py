@@ -40,15 +40,19 @@ def posed_body(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
     return np.asarray(run(local, jnp.asarray(motion.translation, jnp.float32)))
 
 
-def worn_over(a: Assembly, motion: io.MotionRecord) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """What a garment is worn over, body and garments below, as one mesh: vertices (frames, verts, 3) in m, and faces."""
+def worn_over(a: Assembly, motion: io.MotionRecord) -> tuple[np.ndarray, np.ndarray, int] | tuple[None, None, int]:
+    """What a garment is worn over as one mesh, body and garments below.
+
+    Returns:
+        Vertices (frames, verts, 3) in m, faces, and how many of the vertices, the last, are of garments. None without a body.
+    """
     if a.body is None:
-        return None, None
+        return None, None, 0
     vertices, faces = [posed_body(a.body, motion)], [a.body.faces]
     for layer in a.model.under:
         faces.append(np.asarray(layer.model.garment.mesh.faces) + sum(v.shape[1] for v in vertices))
         vertices.append(animated(layer.model, layer.network, layer.params, track_of(layer.model, motion)))
-    return np.concatenate(vertices, axis=1), np.concatenate(faces)
+    return np.concatenate(vertices, axis=1), np.concatenate(faces), sum(v.shape[1] for v in vertices[1:])
 
 
 def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: str = "") -> dict[str, float]:
@@ -72,7 +76,7 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     animations = {f"{alpha:g}": run.animate(track, alpha) for alpha in alphas}
     garment = animations["1"] if "1" in animations else animations["0"]
     faces = run.assembly.garment.faces
-    body_vertices, body_faces = worn_over(run.assembly, run.motion(name))
+    body, body_faces, worn = worn_over(run.assembly, run.motion(name))
     fps = run.assembly.model.fps
     quantities = summarise(run.evaluate(track))
     facts = {
@@ -82,10 +86,10 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
     }
     if "penetrating" in quantities:
         facts["penetrating vertices"] = f"{quantities['penetrating']:.2f} %"
-    pictures.contact_sheet(folder / "preview.png", garment, faces, body_vertices, body_faces, fps)
-    pictures.animation_gif(folder / "preview.gif", garment, faces, body_vertices, body_faces, fps)
+    pictures.contact_sheet(folder / "preview.png", garment, faces, body, body_faces, fps, worn=worn)
+    pictures.animation_gif(folder / "preview.gif", garment, faces, body, body_faces, fps, worn=worn)
     viewer.write_page(
-        folder / "preview.html", animations, faces, body_vertices, body_faces, fps, title or "Neural cloth simulation", facts
+        folder / "preview.html", animations, faces, body, body_faces, fps, title or "Neural cloth simulation", facts, worn
     )
     log = folder / "log.csv"
     if log.exists() and find_spec("matplotlib"):

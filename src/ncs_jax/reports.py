@@ -89,7 +89,7 @@ def evaluate(options) -> int:
     means = {name: summarise(r) | moving[name] for name, r in rows.items()}
     if len(means) > 1:
         every = dict.fromkeys(k for m in means.values() for k in m)
-        means["all"] = {k: float(np.mean([m[k] for m in means.values() if k in m])) for k in every}
+        means["all"] = summarise({k: np.array([m[k] for m in means.values() if k in m]) for k in every})
     labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
     width = max(map(len, labels)) + 2
     for quantity in dict.fromkeys(k for m in means.values() for k in m):

@@ -29,13 +29,15 @@ def write_page(
     fps: float,
     title: str,
     facts: Mapping[str, str],
+    worn: int = 0,
 ) -> None:
     """Write one HTML file that plays a garment on a body in any browser with WebGL 2; it loads nothing from elsewhere.
 
     Args:
         path: of the page. animations: vertices (T, V, 3) in m with Y up, by motion alpha such as "0", "1", "1.5"; if there is
         just one, no switch is shown. garment_faces: (F, 3). body: vertices (T, B, 3) in m, or None. body_faces: its faces, or
-        None. fps: frames per second. title: of the page. facts: figures shown beneath it, by name.
+        None. fps: frames per second. title: of the page. facts: figures shown beneath it, by name. worn: how many of the
+        body's vertices, the last, are of garments worn below, whose faces come last.
 
     Positions are kept to 0.03 mm wherever the garment walks (`test_positions_survive`); a frame that spans more than 3.2 m is
     kept to its span over 130,000. What is not finite, or does not fit together, is an `InputError`.
@@ -59,7 +61,7 @@ def write_page(
         if len(body) != shape[0]:
             raise InputError(f"{shape[0]} frames, as many as the garment has", field="body", value=len(body))
         record, data["track-body"] = _track(body)
-        scene["body"] = {"verts": body.shape[1], "tracks": [record]}
+        scene["body"] = {"verts": body.shape[1], "worn": worn, "tracks": [record]}
         data["body-faces"] = _faces(body_faces, body.shape[1], "body_faces")
     rows = (f"<div><dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd></div>" for k, v in facts.items())
     blocks = (f'<script type="application/octet-stream" id="{name}">{text}</script>' for name, text in data.items())
