@@ -36,7 +36,7 @@ __all__ = [
     "vertex_normals",
 ]
 
-NEAR = 24  # groups of the body's triangles that a group of cloth looks at in a pose of its own
+NEAR = 32  # groups of the body's triangles that a group of cloth looks at in a pose of its own
 
 
 @jax.tree_util.register_dataclass
