@@ -153,7 +153,7 @@ def repeated(results: Path) -> str:
         )
         for folder in (results, other)
     )
-    return f"""## Repeated on another processor
+    return f"""## Repeated with other instructions of the processor
 
 One machine gives every number again, but for the times, to the last digit. One with other instructions rounds differently, and
 a training or a simulation that rounds differently goes its own way: so far apart is the row of each section that is farthest.
