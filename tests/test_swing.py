@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax import InputError, assemble, load_run, train
+from ncs_jax import InputError, assemble, load_run, runs, train
 from ncs_jax.assembly import track_of
 from ncs_jax.kinematics import blend, skin
 from ncs_jax.methods.swing import QUIET, Swing
@@ -187,15 +187,19 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * (1 + np.abs(b).max())), found, expected)
 
 
-def test_training_resuming_and_coming_back(tmp_path, plain_jax):
-    """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference."""
+def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
+    """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference, and is told."""
     tables = load_scene(write_scene(tmp_path)).to_dict()
     tables["network"] |= {"cell": "swing", "vibrations": 3}
-    tables["training"]["motion_augmentation"] = 0.5
+    tables["training"] |= {"motion_augmentation": 0.5, "validate_every": 40}
     tables["garment"]["pins"] = "pins"
     scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
 
-    made = train(scene, tmp_path / "run", steps=40, report=reports.append)
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "IDLE", np.inf)
+        made = train(scene, tmp_path / "run", steps=40, report=reports.append)
+    moved = np.mean([r.moved for r in reports])
+    assert reports[-1].message == f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {moved:.2g} mm"
     fresh = replace(made, params=initial_state(made.assembly.model, made.assembly.network, 0).params)
     before, after = (run.evaluate(scene.motion.files[0])["total"].mean() for run in (fresh, made))
     assert after < before and reports[-1].moved > 1 and not any(r.dropped for r in reports)
@@ -204,7 +208,8 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax):
     motion = scene.motion.files[0]
     np.testing.assert_array_equal(again.animate(motion), made.animate(motion))
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "40")
-    resumed = train(scene, tmp_path / "run", resume=True)
+    resumed = train(scene, tmp_path / "run", resume=True, report=reports.append)
+    assert reports[-1].step == 40 and not reports[-1].message  # it moves
     jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
 
 
