@@ -39,9 +39,13 @@ def conclusion(rows: Sequence[dict]) -> str:
 
     def told(row):
         change = 100 * (row["total"] / none["total"] - 1)
-        return f"{row['augmentation']}: energy {change:+.2f} %, {row['distance'] - none['distance']:+.1f} mm"
+        return f"{row['augmentation']}: energy {change:+.2f} %, {row['distance'] - none['distance']:+.1f} mm{stopped(row)}"
 
-    return f"Against none ({none['total']:.4f} J, {none['distance']:.1f} mm): " + "; ".join(map(told, others)) + "."
+    def stopped(row):
+        return f", {row['stopped_share']:.2f} after a stop" if "stopped_share" in row else ""
+
+    first = f"Against none ({none['total']:.4f} J, {none['distance']:.1f} mm{stopped(none)}): "
+    return first + "; ".join(map(told, others)) + "."
 
 
 main = partial(command, "augmentation", __doc__, experiment)

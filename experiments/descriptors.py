@@ -115,9 +115,10 @@ def conclusion(rows: Sequence[dict]) -> str:
     best = min(rows, key=lambda row: row["unseen_total"])
     free = next(row for row in rows if row["descriptor"] == "heading_free")
     worst = max(rows, key=lambda row: row["turned"])
+    beside = "" if best is free else f"; heading_free {free['unseen_total']:.4f} J"
     return (
-        f"On the unseen motion the lowest energy is that of {best['descriptor']} ({best['unseen_total']:.4f} J; heading_free "
-        f"{free['unseen_total']:.4f} J); turned about gravity, heading_free gives the same to {free['turned']:.2g} mm, "
+        f"On the unseen motion the lowest energy is that of {best['descriptor']} ({best['unseen_total']:.4f} J{beside}); "
+        f"turned about gravity, heading_free gives the same to {free['turned']:.2g} mm, "
         f"{worst['descriptor']} is {worst['turned']:.2g} mm off."
     )
 
