@@ -6,6 +6,7 @@ import csv
 import os
 import platform
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -297,7 +298,7 @@ def train(
         look_at_contacts(local(mesh, state.params))
     log = None if out is None else _Log(out, first)
     dropped, started, pace = int(state.dropped), time.monotonic(), None
-    moved: list[float] = []  # since this was last told
+    moved: deque[float] = deque(maxlen=check // CHUNK)  # of one look alone, it may be that all its frames stand still
     for at, count in chunks(first, steps):
         state, logs = run_steps(at, count, state, steps)
         here, logs = local(mesh, (state, logs))
@@ -316,12 +317,10 @@ def train(
         validation = None
         if scene.motion.validation and (done % check == 0 or done == steps):
             validation = _validate(Run(assembly, here.params))
-        moved += [seen["moved"]] if "moved" in seen else []
-        if moved and (done % check == 0 or done == steps):
-            mean = sum(moved) / len(moved)  # of few frames, it may be that all stand still
-            moved = []
-            if not message and mean < IDLE:
-                message = f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {mean:.2g} mm"
+        if "moved" in seen:
+            moved.append(seen["moved"])
+        if not message and moved and (mean := sum(moved) / len(moved)) < IDLE and (done % check == 0 or done == steps):
+            message = f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {mean:.2g} mm"
         now = time.monotonic()
         if pace is None:  # the first chunk compiles: it does not count for the pace
             pace, started = 0.0, now
