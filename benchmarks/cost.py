@@ -20,13 +20,13 @@ import jax.numpy as jnp
 
 from benchmarks.measure import read, run, table
 from benchmarks.training import batch, ready
-from ncs_jax import training
-from ncs_jax.assembly import Assembly
-from ncs_jax.rollout import animate
-from ncs_jax.rollout import stepper as rollout_of
-from ncs_jax.simulator import simulator_from
-from ncs_jax.simulator import stepper as simulation_of
-from ncs_jax.solver.minimise import Settings
+from ncs_jax.network.rollout import animate
+from ncs_jax.network.rollout import stepper as rollout_of
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.simulation.implicit_euler import simulator_from
+from ncs_jax.simulation.implicit_euler import stepper as simulation_of
+from ncs_jax.simulation.solver.minimise import Settings
+from ncs_jax.training.step import chunk_runner, initial_state
 
 COUNTS = ("flops", "bytes", "temporary", "rounds")
 
@@ -43,9 +43,9 @@ def counted(lowered) -> dict[str, int]:
 def programs(assembly: Assembly) -> dict[str, Callable]:
     """How each program of a scene is lowered."""
     model, network, track = assembly.model, assembly.network, assembly.track
-    state = training.initial_state(model, network, 0)
+    state = initial_state(model, network, 0)
     rollout: Any = rollout_of(model, network, state.params)
-    chunk, indices = training.chunk_runner(network, assembly.scene.training), batch(assembly, 1)
+    chunk, indices = chunk_runner(network, assembly.scene.training), batch(assembly, 1)
 
     def simulated(solver):
         def follow(state, simulator, matrices):

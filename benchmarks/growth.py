@@ -25,10 +25,10 @@ from benchmarks.inference import stream
 from benchmarks.measure import apart, clocks, forget_peak, peak_memory, read, run, timed
 from benchmarks.training import batch, ready, steps
 from ncs_jax import InputError, Run, io
-from ncs_jax.io.npz import write_npz
-from ncs_jax.methods.shared import for_inference
-from ncs_jax.scene import Scene
-from ncs_jax.training import initial_state
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.network.methods.method import for_inference
+from ncs_jax.scene.spec import Scene
+from ncs_jax.training.step import initial_state
 
 MOST = 80_000  # vertices of a garment
 PAIR = 2  # steps in a program

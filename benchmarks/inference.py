@@ -24,8 +24,8 @@ import numpy as np
 from benchmarks import work
 from benchmarks.measure import clocks, peak_memory, read, run, timed
 from ncs_jax import Run, load_run, local_rotations, train
-from ncs_jax.methods.shared import for_inference
-from ncs_jax.rollout import animate, stepper
+from ncs_jax.network.methods.method import for_inference
+from ncs_jax.network.rollout import animate, stepper
 
 CHARACTERS = (1, 4, 16, 64, 256)
 PLACES = 64  # of the motion, that a crowd goes through

@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 
 from ncs_jax import InputError
-from ncs_jax.scene import Scene, load_scene
+from ncs_jax.scene.spec import Scene, load_scene
 
 ROUNDS = 8  # of a part in one compiled loop
 SIDE = 2048  # of the matrices whose product tells the arithmetic limit

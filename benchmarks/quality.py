@@ -23,7 +23,8 @@ from benchmarks.measure import clock, clocks, read, run, table
 from benchmarks.training import ready
 from experiments.seeds import measure
 from ncs_jax import Run
-from ncs_jax.training import CHUNK, batches, chunk_runner, chunks, initial_state
+from ncs_jax.training.batches import CHUNK, batches, chunks
+from ncs_jax.training.step import chunk_runner, initial_state
 
 FALL = (0.5, 0.8, 0.9, 0.95, 0.99)
 SHOWN = {"total": "total J", "strain_mean": "strain %", "penetrating": "inside %", "out_of_balance": "off balance g"}

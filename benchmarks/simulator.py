@@ -24,9 +24,9 @@ from benchmarks import work
 from benchmarks.growth import finer
 from benchmarks.measure import Work, clock, read, run, table
 from ncs_jax import assemble
-from ncs_jax.assembly import Assembly
-from ncs_jax.simulator import simulator_from, stepper
-from ncs_jax.solver.minimise import CONVERGED, Settings
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.simulation.implicit_euler import simulator_from, stepper
+from ncs_jax.simulation.solver.minimise import CONVERGED, Settings
 
 FAST = Settings("quasi_newton", tolerance=1.0)
 TIMES = (1, 4, 16)  # as many triangles

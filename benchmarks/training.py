@@ -25,15 +25,20 @@ from jax import lax
 
 from benchmarks import work
 from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_memory, read, run, timed
-from ncs_jax import assemble, local_rotations, training
-from ncs_jax.assembly import Assembly
-from ncs_jax.devices import give_back
-from ncs_jax.kinematics import blend, skin
-from ncs_jax.methods.shared import garment_blend
-from ncs_jax.model import Model, pose_body
-from ncs_jax.motion import track
-from ncs_jax.objective import Frame, Terms, distances, elastic, energies, pressure
-from ncs_jax.scene import Scene
+from ncs_jax import assemble, local_rotations
+from ncs_jax.energies.elements import elastic
+from ncs_jax.energies.terms import StepInputs, Terms
+from ncs_jax.energies.total import contact_force, distances, energies
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.network.methods.method import garment_blend
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.scene.features import motion_features
+from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.spec import Scene
+from ncs_jax.training.batches import CHUNK, batches
+from ncs_jax.training.devices import give_back
+from ncs_jax.training.loss import gradients, physics, with_bodies
+from ncs_jax.training.step import TrainState, chunk_runner, initial_state
 
 STEPS = 1000  # of the schedule
 NOTHING = Terms(None, bending=False, collision=None, gravity=False, inertia=False)
@@ -44,13 +49,13 @@ def ready(scene: Scene) -> Assembly:
     """A scene as training takes it, with what its motions fix."""
     assembly = assemble(scene)
     give_back()  # as training does
-    return replace(assembly, track=training.with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
+    return replace(assembly, track=with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
 
 
 def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:
     """`count` training steps as one program, and a list of one: the state, which goes on from call to call."""
     model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
-    chunk, held = training.chunk_runner(network, spec), [training.initial_state(model, network, 0)]
+    chunk, held = chunk_runner(network, spec), [initial_state(model, network, 0)]
     ends, pairs = batch(assembly, count)
 
     def several():
@@ -63,7 +68,7 @@ def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:
 def batch(assembly: Assembly, count: int):
     """Last frames of the windows of the first steps, and with whom each is paired: (count, batch) both."""
     size = assembly.scene.training.batch
-    ends = training.batches(assembly.track.start.shape[0], size, 0, 0, count)
+    ends = batches(assembly.track.start.shape[0], size, 0, 0, count)
     return jnp.asarray(ends), jnp.tile(jnp.arange(size, dtype=jnp.int32)[::-1], (count, 1))
 
 
@@ -80,21 +85,21 @@ def _energy(model: Model, name: str) -> Callable:
             given = dict(brought)
             if name == "friction":
                 near = replace(terms, collision=model.terms.collision)
-                given["pressed"] = pressure(given["carried"], given["body"], model.surface, near, model.material)
-            parts = energies(x, model.garment, model.material, Frame(1 / model.fps, **given), terms, model.surface)
+                given["pressed"] = contact_force(given["carried"], given["body"], model.surface, near, model.material)
+            parts = energies(x, model.garment, model.material, StepInputs(1 / model.fps, **given), terms, model.surface)
             return jnp.sum(parts[name])
 
         return jax.value_and_grad(value)(*varied)
 
-    together = name in ("gravity", "inertia") or terms.collision == "plane"  # as in `training.physics`
+    together = name in ("gravity", "inertia") or terms.collision == "plane"  # as in `training.loss.physics`
     return of if together else lambda varied, model: lax.map(lambda pose: of(pose, model), _front(varied))
 
 
-def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[str, tuple]:
+def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple]:
     """Every part that the scene has, by name: a function, what it depends on, and its constants."""
     model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
     terms, params = model.terms, state.params
-    offsets = jax.jit(lambda p: training.gradients(model, network, spec, p, whole, ends, pairs))(params)[2][1]
+    offsets = jax.jit(lambda p: gradients(model, network, spec, p, whole, ends, pairs))(params)[2][1]
     history = len(offsets)
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], whole.start[ends][None])
     matrices = jnp.moveaxis(whole.matrices[back], 1, -1)
@@ -104,8 +109,8 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
         return {}, offsets[0], weights
 
     def networks(whole, params, model):
-        with mock.patch.object(training, "physics", unmoved):
-            return training.gradients(model, network, spec, params, whole, ends, pairs)
+        with mock.patch("ncs_jax.training.loss.physics", unmoved):
+            return gradients(model, network, spec, params, whole, ends, pairs)
 
     def pose(offset, matrices, model):
         return skin(blend(matrices, weights), model.garment.mesh.rest[:, :, None] + offset)
@@ -117,7 +122,7 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
 
     def simulated(varied, model):
         offsets, matrices, body = varied
-        return training.physics(model, weights, offsets, matrices, share, body)
+        return physics(model, weights, offsets, matrices, share, body)
 
     posed = jax.jit(skinned)((offsets, matrices), model)[0]
     x, share = posed[0], jnp.ones(len(ends), posed[0].dtype)
@@ -159,17 +164,17 @@ def parts(assembly: Assembly, state: training.TrainState, ends, pairs) -> dict[s
     return found
 
 
-def optimiser(assembly: Assembly, state: training.TrainState, ends, pairs) -> tuple:
+def optimiser(assembly: Assembly, state: TrainState, ends, pairs) -> tuple:
     """All of a step but its gradient, which is taken as given: as a step of `advanced`, its carry, and its constants."""
     model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
-    given = jax.eval_shape(lambda p: training.gradients(model, network, spec, p, whole, ends, pairs), state.params)
+    given = jax.eval_shape(lambda p: gradients(model, network, spec, p, whole, ends, pairs), state.params)
     given = jax.tree.map(lambda s: jnp.full(s.shape, 1e-6, s.dtype), given)
 
     def update(carry, model, whole):
         state, given = carry
         given = nudged(given, 1e-30 * state.step.astype(jnp.float32))
-        with mock.patch.object(training, "gradients", lambda *_: given):
-            state, _ = training.chunk_runner(network, spec)(state, ends[None], pairs[None], STEPS, model, whole)
+        with mock.patch("ncs_jax.training.step.gradients", lambda *_: given):
+            state, _ = chunk_runner(network, spec)(state, ends[None], pairs[None], STEPS, model, whole)
         return state, given
 
     return update, (state, given), model, whole
@@ -179,7 +184,7 @@ def benchmark(options) -> dict:
     """Measure a scene's training step and its parts."""
     assembly = ready(read(options.scene))
     model, whole = assembly.model, assembly.track
-    rounds, count = (2, 2) if options.quick else (ROUNDS, training.CHUNK)
+    rounds, count = (2, 2) if options.quick else (ROUNDS, CHUNK)
     several, held = steps(assembly, count)
     seconds = {"step": timed(several, options.repeats, count)}
     peak = peak_memory()
@@ -190,7 +195,12 @@ def benchmark(options) -> dict:
     records = [assembly.motions[name] for name in assembly.scene.motion.files]
     poses, places = (jnp.asarray(np.concatenate([getattr(r, k) for r in records])) for k in ("poses", "translation"))
     start = whole.start[: len(poses)]
-    described = (lambda poses, start, model: track(model, *poses, start), (local_rotations(model, poses), places), start, model)
+    described = (
+        lambda poses, start, model: motion_features(model, *poses, start),
+        (local_rotations(model, poses), places),
+        start,
+        model,
+    )
     seconds["descriptors"] = loop(*described)
     needed = work.training(assembly, held[0].params, np.asarray(ends))
     rows: dict[str, dict] = {name: {"seconds": seconds[name], "work": needed[name]} for name in needed if name in seconds}

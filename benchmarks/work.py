@@ -13,10 +13,10 @@ import jax
 import numpy as np
 
 from benchmarks.measure import Work
-from ncs_jax.assembly import Assembly
-from ncs_jax.kinematics import Blend
-from ncs_jax.model import Model
-from ncs_jax.solver.cholesky import Elimination
+from ncs_jax.geometry.skinning import Blend
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.scene.model import Model
+from ncs_jax.simulation.solver.cholesky import Elimination
 
 
 def numbers(params, name: str = "") -> float:

@@ -36,13 +36,13 @@ from experiments.study import (
     write,
 )  # fmt: skip
 from ncs_jax import Run, Scene
-from ncs_jax.assembly import track_of
 from ncs_jax.io import MotionRecord
-from ncs_jax.methods.ncs import NCS
-from ncs_jax.methods.shared import Codes, Method
-from ncs_jax.methods.snug import SNUG
-from ncs_jax.motion import Track
-from ncs_jax.networks import DynamicEncoder
+from ncs_jax.network.encoders import DynamicEncoder
+from ncs_jax.network.methods.method import Codes, Method
+from ncs_jax.network.methods.ncs import NCS
+from ncs_jax.network.methods.snug import SNUG
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.features import MotionFeatures
 
 TAPS = 11  # frames that the window sees
 STILL = 0.1  # of what the simulation moves after a stop
@@ -115,18 +115,18 @@ class OneCode(SNUG):
         return terms
 
 
-def one_code(ncs: Any, track: Track) -> Method:
+def one_code(ncs: Any, track: MotionFeatures) -> Method:
     """The same sizes and decoder."""
     d = ncs.dynamic
     return OneCode(DynamicEncoder((), d.sizes, d.state, d.dtype, bias=True), ncs.decoder, ncs.learn_weights)
 
 
-def biased(ncs: Any, track: Track) -> Method:
+def biased(ncs: Any, track: MotionFeatures) -> Method:
     """With bias in the dynamic encoder."""
     return replace(ncs, dynamic=ncs.dynamic.clone(bias=True))
 
 
-def windowed(ncs: Any, track: Track) -> Method:
+def windowed(ncs: Any, track: MotionFeatures) -> Method:
     """With the window."""
     d, joints = ncs.dynamic, track.dynamic.shape[1:]
     encoder = WindowEncoder(d.joint_sizes, d.sizes, d.state, d.dtype)
@@ -134,7 +134,7 @@ def windowed(ncs: Any, track: Track) -> Method:
 
 
 # A cell that a scene file names, or a network that none does.
-ARCHITECTURES: dict[str, str | Callable[[Any, Track], Method]] = {
+ARCHITECTURES: dict[str, str | Callable[[Any, MotionFeatures], Method]] = {
     "two codes, gated unit without bias": "gated",
     "one code, gated unit": one_code,
     "with bias": biased,
@@ -154,7 +154,7 @@ def rest(run: Run, motion: str) -> dict:
 
     def moved(*parts):
         made = MotionRecord(*(np.concatenate(part) for part in zip(*parts, strict=True)), record.fps, record.joint_names)
-        return run.animate(track_of(model, made)).astype(np.float64)
+        return run.animate(features_from_records(model, made)).astype(np.float64)
 
     def apart(a, b):
         return 1000 * np.linalg.norm(a - b, axis=-1).mean(axis=-1)

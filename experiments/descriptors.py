@@ -21,11 +21,11 @@ import numpy as np
 
 from experiments.study import abreast, bars, changed, command, fitted, judged, recurrent, reference, trained, without, write
 from ncs_jax import Run, Scene, local_rotations
-from ncs_jax.descriptors import DESCRIPTORS
-from ncs_jax.methods.ncs import NCS
-from ncs_jax.methods.shared import Method
-from ncs_jax.motion import Track, track
-from ncs_jax.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.ncs import NCS
+from ncs_jax.scene.descriptors import DESCRIPTORS
+from ncs_jax.scene.features import MotionFeatures, motion_features
 
 TURN = 135.0  # degrees
 SIX = DESCRIPTORS["six"]
@@ -64,12 +64,12 @@ class WithoutGravity(NCS):
         return replace(track, static=self._blind(track.static, SIX), dynamic=self._blind(track.dynamic, SIX))
 
 
-def without_gravity(network: Any, track: Track) -> Method:
+def without_gravity(network: Any, track: MotionFeatures) -> Method:
     """The same networks, blind to it."""
     return WithoutGravity(network.static, network.dynamic, network.decoder, network.learn_weights)
 
 
-def turned(run: Run, motion: str) -> tuple[np.ndarray, Track]:
+def turned(run: Run, motion: str) -> tuple[np.ndarray, MotionFeatures]:
     """The rotation about gravity, and the motion as it is after it."""
     model, record = run.assembly.model, run.motion(motion)
     down = model.material.gravity / jnp.linalg.norm(model.material.gravity)
@@ -77,7 +77,7 @@ def turned(run: Run, motion: str) -> tuple[np.ndarray, Track]:
     local, root = local_rotations(model, jnp.asarray(record.poses)), model.skeleton.joints[0]
     local = local.at[:, 0].set(jnp.matmul(turn, local[:, 0], precision="highest"))
     way = jnp.matmul(jnp.asarray(record.translation) + root, turn.T, precision="highest") - root
-    return np.asarray(turn, np.float64), track(model, local, way, jnp.zeros(len(local), jnp.int32))
+    return np.asarray(turn, np.float64), motion_features(model, local, way, jnp.zeros(len(local), jnp.int32))
 
 
 def measured(scene: Scene, unseen: str, steps: int, kept: Path, blind: bool) -> dict:

@@ -31,10 +31,11 @@ from jaxtyping import Array, Float
 from experiments.fit_material import sheet
 from experiments.study import write
 from ncs_jax import assemble, scene_from
-from ncs_jax.io.npz import write_npz
-from ncs_jax.kinematics import blend
-from ncs_jax.model import Model
-from ncs_jax.objective import Frame, total
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import total
+from ncs_jax.geometry.skinning import blend
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.scene.model import Model
 
 SIDE, FPS, FRAMES, TILT = 5, 30.0, 20, 35.0  # vertices a side, frames/s, frames, degrees
 SEEDS = 3
@@ -103,7 +104,7 @@ def energy(case: Case, now, previous, before, stop: bool) -> tuple[Array, Float[
     """The energy (10) of a frame in J from its coefficients and those of the two before, and where the sheet is."""
     model, modes = replace(case.model, terms=replace(case.model.terms, through_time=not stop)), case.modes
     x, *earlier = (case.start + modes @ c for c in (now, previous, before))
-    frame = Frame(1 / model.fps, *earlier, blended=blend(jnp.broadcast_to(jnp.eye(3, 4), (1, 3, 4)), model.blend))
+    frame = StepInputs(1 / model.fps, *earlier, blended=blend(jnp.broadcast_to(jnp.eye(3, 4), (1, 3, 4)), model.blend))
     return total(x, model.garment, model.material, frame, model.terms), x
 
 

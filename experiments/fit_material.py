@@ -46,12 +46,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ncs_jax import InputError, Model, assemble, scene_from
-from ncs_jax.assembly import track_of
-from ncs_jax.io.npz import write_npz
-from ncs_jax.kinematics import blend, skin, unpose
-from ncs_jax.motion import Track
-from ncs_jax.simulator import Simulator, simulate, simulator_from, stepper
-from ncs_jax.solver.minimise import CONVERGED, Settings
+from ncs_jax.geometry.skinning import blend, skin, unpose
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.simulation.implicit_euler import Simulator, simulate, simulator_from, stepper
+from ncs_jax.simulation.solver.minimise import CONVERGED, Settings
 
 FRAMES = {"hanging": 8, "tshirt": 4}  # by default, of every cloth
 PARAMETERS = ("stretch", "bending", "density")
@@ -69,7 +69,7 @@ class Problem:
     """A cloth, how its character moves, and the known forces on it in N."""
 
     simulator: Simulator
-    track: Track
+    track: MotionFeatures
     forces: Float[Array, "frames verts 3"]
 
 
@@ -113,7 +113,7 @@ def tshirt(frames: int, pressure: float, start: int = 16) -> Problem:
     motion = "ncs:lift_arms"
     tables = {"motion": {"files": [motion]}, "network": {"modes": 0}, "physics": {"collision": {"distance": "smooth"}}}
     assembly = assemble(scene_from(tables), dtype=jnp.float64)
-    track = track_of(assembly.model, assembly.motions[motion])
+    track = features_from_records(assembly.model, assembly.motions[motion])
     if start + frames > len(track.matrices):
         raise InputError(f"1 to {len(track.matrices) - start} frames expected", file=motion, field="frames", value=frames)
     part = jax.tree.map(lambda a: a[start : start + frames], track)

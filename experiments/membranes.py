@@ -21,8 +21,8 @@ import numpy as np
 from experiments.fit_material import sheet
 from experiments.study import COLUMNS, abreast, axes_of, changed, command, networks, reference, without, write
 from ncs_jax import Scene
-from ncs_jax.mesh import mesh_from
-from ncs_jax.objective import MEMBRANES
+from ncs_jax.energies.terms import MEMBRANES
+from ncs_jax.geometry.mesh import mesh_from
 
 LENGTHS = np.linspace(1, 0.02, 99)  # of the rest length
 YIELDS = {"yields": "force greatest at, of its length", "collapses": "force zero again at"}

@@ -3,7 +3,7 @@
     python -m experiments.methods [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick] [--out runs/methods]
 
 Every network is trained on the scene's motions but the unseen ones, two at a time, and judged on those beside the
-simulation: energies, strain, penetration and how it moves (`ncs_jax.dynamics.MEASURES`), after a stop on the first
+simulation: energies, strain, penetration and how it moves (`ncs_jax.metrics.motion.MEASURES`), after a stop on the first
 motion that has one. Writes methods.csv, .md and .png, a strip of the same frames of all four for each motion.
 """
 
@@ -33,7 +33,7 @@ from experiments.study import (
     write,
 )
 from ncs_jax import Run, Scene, assemble
-from ncs_jax.dynamics import stops
+from ncs_jax.metrics.motion import stops
 
 METHODS = ("pbns", "snug", "ncs")
 RECURRENT = "ncs, gated"  # beside NCS with the garment's own swing, if that is the scene's
@@ -82,8 +82,9 @@ def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -
     """The contact sheets of all methods below each other, of a motion up to a second after its last stop."""
     from PIL import Image, ImageDraw
 
-    from ncs_jax.pictures import INK, PAPER, contact_sheet
-    from ncs_jax.preview import worn_over
+    from ncs_jax.view.pictures import INK, contact_sheet
+    from ncs_jax.view.preview import worn_over
+    from ncs_jax.view.rasteriser import PAPER
 
     a = run.assembly
     body, faces, worn = worn_over(a, run.motion(motion))

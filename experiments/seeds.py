@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax import InputError, Report, Run, load_scene, summarise, train
-from ncs_jax.scene import Scene
+from ncs_jax.scene.spec import Scene
 
 COLUMNS = ("total", "membrane", "bending", "collision", "gravity", "inertia", "strain_mean", "penetrating", "out_of_balance")
 

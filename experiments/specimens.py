@@ -14,14 +14,15 @@ import numpy as np
 
 from experiments.study import changed
 from ncs_jax import Assembly, Scene, assemble, scene_from
-from ncs_jax.assembly import track_of
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.energies.proximity import groups_from, nearby_pairs
-from ncs_jax.io.npz import write_npz
-from ncs_jax.kinematics import blend, skin
-from ncs_jax.mesh import mesh_from
-from ncs_jax.model import pose_body
-from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, energies, pressure
+from ncs_jax.energies.contact.pairs import groups_from, nearby_pairs
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import contact_force, energies
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.model import pose_body
 
 
 @dataclass(frozen=True)
@@ -199,11 +200,11 @@ def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]
         on = smooth if terms.collision == "smooth" else surface
         pressed = None
         if terms.friction:
-            pressed = pressure(array(s.carried), array(s.body), on, replace(ALONE, collision="plane"), own)
+            pressed = contact_force(array(s.carried), array(s.body), on, replace(ALONE, collision="plane"), own)
         groups = groups_from(mesh) if terms.self_contact else None
         if groups is not None and crowded(array(s.three[0]), mesh, groups, own.self_thickness):
             continue
-        frame = Frame(
+        frame = StepInputs(
             array(s.dt), array(s.three[1]), array(s.three[2]), array(s.body), array(s.blended), array(s.carried), pressed
         )
         garment = Garment(mesh, jnp.asarray(s.pins, jnp.int32), groups)
@@ -281,7 +282,7 @@ def limbs(scene: Scene) -> list[tuple[str, Assembly]]:
         for name, degrees in turned.items():
             poses[at_once, names.index(name)] = np.radians(degrees)
         record = replace(like, poses=poses, translation=at_once[:, None] * np.asarray(way, float))
-        return replace(a, track=track_of(a.model, record))
+        return replace(a, track=features_from_records(a.model, record))
 
     cases: dict[str, tuple] = {
         "arms through the torso": ({"LeftArm": (0, -170, 0), "RightArm": (0, 170, 0)},),

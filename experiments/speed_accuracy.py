@@ -42,9 +42,10 @@ from ncs_jax import (
     summarise,
     train,
 )
-from ncs_jax.assembly import load_motion, track_of
-from ncs_jax.io.npz import write_npz
-from ncs_jax.scene import PRESETS
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.scene.spec import PRESETS
 
 COLUMNS = {
     "point": "",
@@ -106,7 +107,7 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
 def judged(point: Point, vertices: np.ndarray) -> dict[str, Any]:
     """The vertices, and every quantity by the energies of the point's judge."""
     assembly = assemble(point.judge)
-    track = track_of(assembly.model, load_motion(assembly.scene, motion_of(point.scene), assembly.body))
+    track = features_from_records(assembly.model, load_motion(assembly.scene, motion_of(point.scene), assembly.body))
     return {"vertices": vertices, **summarise(measure(assembly.model, vertices, track))}
 
 

@@ -32,17 +32,19 @@ import numpy as np
 from experiments.specimens import TERMS, along_axis, evaluated, hanging, least, limbs, shapes, specimen
 from experiments.study import axes_of, changed, write_csv, write_markdown
 from ncs_jax import InputError, Scene, assemble, load_scene, train
-from ncs_jax.assembly import track_of
+from ncs_jax.energies.terms import Material
 from ncs_jax.io import MotionRecord
-from ncs_jax.methods.swing import Swing
-from ncs_jax.model import Model
-from ncs_jax.motion import Track
-from ncs_jax.objective import Material
-from ncs_jax.rollout import animate
-from ncs_jax.simulation import rounding
-from ncs_jax.simulator import simulate, simulator_from
-from ncs_jax.solver.minimise import Settings
-from ncs_jax.training import TrainState, batches, chunk_runner, initial_state, with_bodies
+from ncs_jax.network.methods.swing import Swing
+from ncs_jax.network.rollout import animate
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.simulate import rounding
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
+from ncs_jax.simulation.solver.minimise import Settings
+from ncs_jax.training.batches import batches
+from ncs_jax.training.loss import with_bodies
+from ncs_jax.training.step import TrainState, chunk_runner, initial_state
 
 TOLERANCE = 1e-3
 # g; with 0.1, what is left out of balance may be a thousandth of the result where the cloth is taut and folds softly
@@ -149,14 +151,14 @@ class Wearer:
 
 def worn(a: Any, params: dict, record: MotionRecord, alpha: float, dtype: Any) -> np.ndarray:
     """Vertices of a trained garment, seen from the root, worked out in a precision."""
-    track = track_of(a.model, record)
+    track = features_from_records(a.model, record)
     params = jax.tree.map(lambda p: jnp.asarray(p, dtype), params)
     x = track.relative(animated(a.network, a.model, params, track, jnp.asarray(alpha, dtype)))
     return x.astype(np.float64) - np.asarray(track.matrices[:, 0, :, 3], np.float64)[:, None]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def animated(network, model: Model, params: dict, track: Track, alpha):
+def animated(network, model: Model, params: dict, track: MotionFeatures, alpha):
     """The vertices of a motion."""
     return animate(model, network, params, track, alpha)
 
@@ -266,7 +268,7 @@ def hung(folder: Path, axis: str, value: float, dtype: Any, cell: str = "gated")
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def simulated(simulator, track: Track, settings: Settings):
+def simulated(simulator, track: MotionFeatures, settings: Settings):
     """Vertices and how it went."""
     return simulate(simulator, track, settings)
 

@@ -24,13 +24,15 @@ import jax
 import numpy as np
 
 from ncs_jax import InputError, Run, Scene, assemble, load_scene, scene_from, simulate, summarise, train
-from ncs_jax.dynamics import compare, dynamics
-from ncs_jax.evaluation import measure
 from ncs_jax.io import read_motion
-from ncs_jax.io.npz import write_npz
-from ncs_jax.methods.shared import Method
-from ncs_jax.motion import Track
-from ncs_jax.training import batches, chunk_runner, chunks, initial_state, with_bodies
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.metrics.motion import compare_motion, measure_motion
+from ncs_jax.metrics.quality import measure
+from ncs_jax.network.methods.method import Method
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.training.batches import batches, chunks
+from ncs_jax.training.loss import with_bodies
+from ncs_jax.training.step import chunk_runner, initial_state
 
 UNSEEN = ("ncs:mixed", "ncs:walk_turn_stop")  # the second has a stop
 STAND = 4.0  # s for which a stop at a motion's end is held on: a skirt swings for as long again as it does there
@@ -138,7 +140,7 @@ def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
     return run, seconds[-1] / 60
 
 
-def fitted(scene: Scene, altered: Callable[[Any, Track], Method], steps: int) -> tuple[Run, float]:
+def fitted(scene: Scene, altered: Callable[[Any, MotionFeatures], Method], steps: int) -> tuple[Run, float]:
     """As `trained`, of a network that no scene file names. Nothing is kept."""
     began, a, spec = time.monotonic(), assemble(scene), scene.training
     if a.track is None:
@@ -156,7 +158,7 @@ def fitted(scene: Scene, altered: Callable[[Any, Track], Method], steps: int) ->
 def moving(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:
     """Every measure of motion beside the simulation of an animation of a run's garment."""
     model, track = run.assembly.model, run.track(motion)
-    return dynamics(model, vertices, track) | compare(model, vertices, simulated, track)
+    return measure_motion(model, vertices, track) | compare_motion(model, vertices, simulated, track)
 
 
 def judged(run: Run, motion: str, vertices: np.ndarray, simulated: np.ndarray) -> dict[str, float]:

@@ -10,8 +10,8 @@ import pygltflib as gl
 from scipy.spatial.transform import Rotation, Slerp
 
 from ncs_jax import io
-from ncs_jax.kinematics import Skeleton, forward, to_rest_axes, transforms
-from ncs_jax.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Skeleton, forward, to_rest_axes, transforms
 from tests.scenes import post
 
 NAMES = ("Hips", "Spine", "Head")

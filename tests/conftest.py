@@ -20,8 +20,7 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Before the package is first imported; users pay nothing for it. Only the modules that compute with arrays.
-ARRAYS = ["numerics", "rotations", "mesh", "modes", "energies", "kinematics", "descriptors", "networks", "objective"]
-ARRAYS += ["model", "motion", "methods", "rollout"]
+ARRAYS = ["geometry", "energies", "scene.descriptors", "scene.model", "scene.features", "network"]
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int is good where a float is
 install_import_hook([f"ncs_jax.{name}" for name in ARRAYS], CHECKER)
 

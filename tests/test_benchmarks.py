@@ -13,9 +13,9 @@ from benchmarks.cost import counted
 from benchmarks.measure import COPIES, Limits, Work, apart, looped, nudged, table, timed
 from experiments import seeds
 from ncs_jax import assemble, io, load_scene, train
-from ncs_jax.methods.shared import decode, for_inference
-from ncs_jax.solver.cholesky import elimination
-from ncs_jax.training import initial_state
+from ncs_jax.network.methods.method import decode, for_inference
+from ncs_jax.simulation.solver.cholesky import elimination
+from ncs_jax.training.step import initial_state
 
 from .scenes import SCENE, write_scene
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.mesh import mesh_from
-from ncs_jax.solver.cholesky import LEAF, elimination, factorise, solve
-from ncs_jax.solver.stiffness import couplings_from
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.simulation.solver.cholesky import LEAF, elimination, factorise, solve
+from ncs_jax.simulation.solver.stiffness import couplings_from
 
 from .scenes import grid
 from .shapes import sheet, tube

@@ -13,8 +13,9 @@ import pytest
 
 from ncs_jax import io
 from ncs_jax.cli import main
-from ncs_jax.preview import posed_body
-from ncs_jax.runs import load_run, train
+from ncs_jax.runs.run import load_run
+from ncs_jax.runs.train import train
+from ncs_jax.view.preview import posed_body
 
 from .characters import skinned
 from .scenes import grid, post, swing, write_scene
@@ -333,7 +334,7 @@ def test_evaluate_of_all_motions_tells_the_deepest_of_them(run_folder, tmp_path,
     _, folder = run_folder
     np.savez(tmp_path / "nods.npz", **swing(size=3.0))
     motions = (*load_run(folder).assembly.scene.motion.files, str(tmp_path / "nods.npz"))
-    monkeypatch.setattr("ncs_jax.reports.motions_of", lambda scene: motions)
+    monkeypatch.setattr("ncs_jax.scene.spec.Scene.motions", motions)
     assert main(["evaluate", str(folder)]) == 0
     told, quantity = {}, ""
     for line in capsys.readouterr().out.splitlines():

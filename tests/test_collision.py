@@ -11,18 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.collision import (
-    closest_weights,
-    collision,
-    nearest_triangle,
-    nearest_vertex,
-    plane_distance,
-    relisted,
-    surface_from,
-    triangle_distance,
-    vertex_normals,
-)
-from ncs_jax.energies.smooth_contact import blended, curvatures, nearby_quadrics
+from ncs_jax.energies.contact.collision import collision
+from ncs_jax.energies.contact.distance import closest_weights, plane_distance, triangle_distance
+from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
+from ncs_jax.energies.contact.smooth import blended_contact, curvatures, nearby_quadrics
+from ncs_jax.energies.contact.surface import rebuild_lists, surface_from, vertex_normals
 
 from .shapes import ball, bracket, rotation, sheet, tube
 
@@ -143,7 +136,7 @@ def test_lists_of_where_cloth_is_now_prove_what_the_old_ones_do_not_and_find_the
     """Cloth that has slid a quarter around the ball since it was grouped."""
     x, body = jnp.asarray(0.84 * CLOTH @ rotation([0, 1, 0], 1.5).T), jnp.asarray(BALL)
     old = replace(USUAL, vertex_lists=USUAL.vertex_lists[:14])
-    new = relisted(USUAL, [(np.asarray(x), BALL)])
+    new = rebuild_lists(USUAL, [(np.asarray(x), BALL)])
     new = replace(new, vertex_lists=new.vertex_lists[:14])
     (before, unproven), (after, proven) = (searches("vertex", True)(x, body, s) for s in (old, new))
     np.testing.assert_array_equal(before, after)
@@ -336,7 +329,7 @@ def smooth(thickness=THICKNESS):
 
     def whole(x, body, surface):
         def shortfalls(x, body):
-            found = blended(x, nearby_quadrics(x, body, surface), surface, thickness)
+            found = blended_contact(x, nearby_quadrics(x, body, surface), surface, thickness)
             return found.shortfall, found.distance
 
         shortfall, pull, distance = jax.vjp(shortfalls, x, body, has_aux=True)
@@ -407,19 +400,19 @@ def test_smooth_contact_is_the_formula_over_all_vertices(name):
     assert len(surface.vertex_blocks) > surface.groups  # or nothing would be left out
     for come in (0.0, 0.5 * h):
         near = nearby_quadrics(jnp.asarray(x) - come * jnp.asarray([[0.6, 0, 0.8]]), jnp.asarray(vertices), surface)
-        found = blended(jnp.asarray(x), near, surface, THICKNESS)
+        found = blended_contact(jnp.asarray(x), near, surface, THICKNESS)
         close = np.abs(distance) < h  # deeper or farther off, more vertices weigh alike
         np.testing.assert_allclose(found.distance[close], distance[close], rtol=0, atol=5e-3 * h)
         np.testing.assert_allclose(np.sqrt(found.shortfall)[close], np.sqrt(shortfall)[close], rtol=0, atol=5e-3 * h)
         if come == 0:
             wrong = np.maximum(np.abs(found.distance - distance), np.abs(np.sqrt(found.shortfall) - np.sqrt(shortfall)))
             assert (wrong < 5e-3 * h).mean() > 0.99 and wrong.max() < 0.02 * h
-        by_transposition = jax.grad(lambda x, near=near: jnp.sum(blended(x, near, surface, THICKNESS).shortfall))(
+        by_transposition = jax.grad(lambda x, near=near: jnp.sum(blended_contact(x, near, surface, THICKNESS).shortfall))(
             jnp.asarray(x)
         )
         np.testing.assert_allclose(found.slope, by_transposition, rtol=0, atol=1e-10 * float(jnp.abs(found.slope).max()))
     some = jnp.asarray([5, 3, 77])
-    part = blended(jnp.asarray(x), near, surface, THICKNESS, some)
+    part = blended_contact(jnp.asarray(x), near, surface, THICKNESS, some)
     for one, all_ in zip(part, found, strict=True):
         np.testing.assert_allclose(one, all_[some], rtol=1e-9, atol=1e-15)
 

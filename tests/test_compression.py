@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import track_of
-from ncs_jax.compression import compress
-from ncs_jax.model import local_rotations
-from ncs_jax.rollout import animate, stepper
+from ncs_jax.network.compression import compress
+from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.model import local_rotations
 
 from .test_rollout import ready, run
 
@@ -20,7 +20,7 @@ def error(whole, smaller):
 @pytest.fixture
 def garment(tmp_path):
     assembly, params, motion = ready(tmp_path)
-    return assembly, params, motion, track_of(assembly.model, motion)
+    return assembly, params, motion, features_from_records(assembly.model, motion)
 
 
 def smaller(garment, **options):
@@ -62,7 +62,7 @@ def test_a_smaller_decoder_holds_fewer_numbers_and_streams_what_it_animates(garm
 
 def test_sixteen_bits_cost_a_rounding_of_the_offsets(tmp_path):
     assembly, params, motion = ready(tmp_path, jnp.float32)
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     network, short = compress(assembly.network, params, assembly.model, track, bfloat16=True)
     assert short["decoder"]["offsets"]["kernel"].dtype == jnp.bfloat16
     whole = run(assembly, params, motion)

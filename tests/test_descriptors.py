@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.descriptors import ACCELERATION_SCALE, DESCRIPTORS, RATE_SCALE, Joints, dynamic, static
+from ncs_jax.scene.descriptors import ACCELERATION_SCALE, DESCRIPTORS, RATE_SCALE, Joints, dynamic, static
 
 from .shapes import rotation
 

@@ -16,10 +16,11 @@ import jax
 import numpy as np
 import pytest
 
-from ncs_jax.devices import batch_mesh
 from ncs_jax.errors import InputError
-from ncs_jax.runs import load_run, train
-from ncs_jax.training import initial_state
+from ncs_jax.runs.run import load_run
+from ncs_jax.runs.train import train
+from ncs_jax.training.devices import batch_mesh
+from ncs_jax.training.step import initial_state
 
 from .scenes import SCENE, write_scene
 
@@ -30,10 +31,11 @@ BARE = MIXED.replace('validation = ["swing.npz"]', "") + "[physics.collision]\ns
 EIGHT = """
 import dataclasses, json, sys
 import jax, jax.numpy as jnp, numpy as np
-from ncs_jax.assembly import assemble
-from ncs_jax.devices import batch_mesh, copied, divided, local
-from ncs_jax.scene import load_scene
-from ncs_jax.training import batches, chunk_runner, initial_state
+from ncs_jax.runs.run import assemble
+from ncs_jax.training.devices import batch_mesh, copied, divided, local
+from ncs_jax.scene.spec import load_scene
+from ncs_jax.training.batches import batches
+from ncs_jax.training.step import chunk_runner, initial_state
 
 jax.config.update("jax_enable_x64", sys.argv[2] == "float64")
 assembly = assemble(load_scene(sys.argv[1]), dtype=jnp.dtype(sys.argv[2]))
@@ -159,7 +161,7 @@ def test_every_host_has_as_many_devices_of_the_mesh(monkeypatch, batch, devices,
     every = [SimpleNamespace(process_index=p) for p, n in enumerate(devices) for _ in range(n)]
     monkeypatch.setattr(jax, "devices", lambda: every)
     monkeypatch.setattr(jax, "process_count", lambda: len(devices))
-    monkeypatch.setattr("ncs_jax.devices.Mesh", lambda chosen, axes: chosen)
+    monkeypatch.setattr("ncs_jax.training.devices.Mesh", lambda chosen, axes: chosen)
     chosen = batch_mesh(batch)
     assert len(chosen) == size
     assert [sum(d.process_index == p for d in chosen) for p in range(2)] == [size // 2, size // 2]

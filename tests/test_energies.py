@@ -13,23 +13,18 @@ from ncs_jax.energies import neo_hookean as neo
 from ncs_jax.energies import stvk as saint
 from ncs_jax.energies.baraff_witkin import baraff_witkin
 from ncs_jax.energies.bending import bending
-from ncs_jax.energies.collision import (
-    collision,
-    nearest_triangle,
-    nearest_vertex,
-    plane_distance,
-    surface_from,
-    triangle_distance,
-    vertex_normals,
-)
+from ncs_jax.energies.contact.collision import collision
+from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
+from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
+from ncs_jax.energies.contact.surface import surface_from, vertex_normals
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.mass_spring import mass_spring
 from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.stvk import stvk
-from ncs_jax.kinematics import unpose
-from ncs_jax.mesh import mesh_from
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.geometry.skinning import unpose
 
 from .shapes import ball, equilateral, rotation, sheet, tube
 

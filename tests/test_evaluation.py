@@ -5,11 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble, track_of
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.energies.proximity import groups_from, intersecting
-from ncs_jax.evaluation import BLOCK, _depth, measure, summarise, winding_number
-from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.energies.contact.intersections import intersecting
+from ncs_jax.energies.contact.pairs import groups_from
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.metrics.quality import BLOCK, _depth, measure, summarise, winding_number
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import load_scene, scene_from
 
 from .scenes import write_scene
 from .shapes import ball, tube
@@ -25,7 +27,7 @@ def still(model, frames=4):
     """A track of the rest pose."""
     from ncs_jax.io import MotionRecord
 
-    return track_of(model, MotionRecord(np.zeros((frames, 2, 3)), np.zeros((frames, 3)), model.fps, ()))
+    return features_from_records(model, MotionRecord(np.zeros((frames, 2, 3)), np.zeros((frames, 3)), model.fps, ()))
 
 
 @pytest.fixture

@@ -12,12 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import assemble, load_motion, track_of
-from ncs_jax.methods.shared import decode
-from ncs_jax.model import local_rotations
-from ncs_jax.rollout import animate, stepper
-from ncs_jax.scene import load_scene, scene_from
-from ncs_jax.training import initial_state
+from ncs_jax.network.methods.method import decode
+from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import local_rotations
+from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.training.step import initial_state
 
 from .scenes import write_scene
 
@@ -52,7 +54,7 @@ def tiny(folder, dtype=jnp.float64, gravity=GRAVITIES["-y"]):
 
 
 def run(assembly, params, motion, alpha=1.0):
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     return np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, assembly.network, params, track, alpha))
 
 
@@ -202,7 +204,7 @@ def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
     """z = z_S + alpha z_D (15), with the codes that training sees in a window that reaches back to the motion's start."""
     assembly, params, motion = tiny(tmp_path)
     model, network = assembly.model, assembly.network
-    track = track_of(model, motion)
+    track = features_from_records(model, motion)
     frames = len(motion.poses)
     ends = jnp.array([frames - 1], jnp.int32)
     codes = jax.jit(lambda p, t: network.windows(p, t, ends, frames, frames))(params, track)
@@ -219,7 +221,7 @@ def test_a_window_that_begins_within_the_motion_begins_at_rest(tmp_path):
     """What training sees is a stream that was switched on at the window's first frame, with the frames before it known."""
     assembly, params, motion = tiny(tmp_path)
     network = assembly.network
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     end, length = 17, 6
     run_window = jax.jit(lambda p, t: network.windows(p, t, jnp.array([end, 2], jnp.int32), length, 2))
     _, z, _ = run_window(params, track)

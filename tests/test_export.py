@@ -14,14 +14,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import assemble
 from ncs_jax.errors import InputError
-from ncs_jax.export import FORMATS, export, flat_step
-from ncs_jax.methods.shared import for_inference, initial_parameters
-from ncs_jax.model import local_rotations
-from ncs_jax.rollout import stepper
-from ncs_jax.runs import Run
-from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.export.step import FORMATS, export, flat_step
+from ncs_jax.network.methods.method import for_inference, initial_parameters
+from ncs_jax.network.rollout import stepper
+from ncs_jax.runs.run import Run, assemble
+from ncs_jax.scene.model import local_rotations
+from ncs_jax.scene.spec import load_scene, scene_from
 
 from .scenes import post, swing, write_scene
 from .test_rollout import ready, shaken
@@ -237,7 +236,7 @@ def test_without_a_runtime_nothing_is_checked(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     made = Run(assembly, params).export(tmp_path / "step.onnx")
     assert made.check is None and "not checked" in str(made) and made.file.exists()
-    monkeypatch.setattr("ncs_jax.export.find_spec", lambda name: None)
+    monkeypatch.setattr("ncs_jax.export.step.find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install flatbuffers"):
         Run(assembly, params).export(tmp_path / "step", format="stablehlo")
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.io.fbx import Fbx, Packed, Record, read_fbx
-from ncs_jax.io.fbx_character import _graph, _worlds
-from ncs_jax.io.fbx_curve import Curve, curve_from
+from ncs_jax.io.character.fbx import Fbx, Packed, Record, read_fbx
+from ncs_jax.io.character.fbx_character import _graph, _worlds
+from ncs_jax.io.character.fbx_curve import Curve, curve_from
 from tests import fbx_files as fbx
 from tests.characters import JOINTS, NAMES, figure, posed, rigid
 

@@ -6,9 +6,9 @@ import trimesh
 
 from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
-from ncs_jax.fit import BAND, fit, place
-from ncs_jax.mesh import topology
-from ncs_jax.scene import ASSETS
+from ncs_jax.geometry.mesh import topology
+from ncs_jax.prepare.fit import BAND, fit, place
+from ncs_jax.scene.spec import ASSETS
 
 from .scenes import post, write_scene
 from .shapes import tube
@@ -114,9 +114,9 @@ def test_weights_do_not_tear_a_skirt_between_the_legs():
     """Skinned alone, edges of the packaged skirt, walking, are 1.8 times as long by averaging, and 1.2 at most so."""
     import jax.numpy as jnp
 
-    from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, transforms
-    from ncs_jax.model import smooth_weights, transfer_weights
-    from ncs_jax.rotations import axis_angle_to_matrix
+    from ncs_jax.geometry.rotations import axis_angle_to_matrix
+    from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, transforms
+    from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights
 
     body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
     found = fit("skirt.npz", skirt, body).garment

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.friction import SLIP, friction
+from ncs_jax.energies.contact.friction import SLIP, friction
 
 DT, GRAVITY, MASS = 1 / 30, 9.81, 2e-4
 ALONG, NORMAL = np.array([np.cos(0.4), -np.sin(0.4), 0.0]), np.array([np.sin(0.4), np.cos(0.4), 0.0])

@@ -11,10 +11,10 @@ import pytest
 from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
-from ncs_jax.io.axes import upright
-from ncs_jax.io.polygons import triangulate
-from ncs_jax.io.surface import anatomy
-from ncs_jax.worn import check_worn
+from ncs_jax.io.mesh.axes import upright
+from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.surface import summarise_surface
+from ncs_jax.prepare.garment_checks import check_worn
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube
@@ -245,11 +245,11 @@ def test_vertices_are_welded_only_when_asked(tmp_path, suffix):
         path.write_bytes(ply("binary_little_endian", apart.tolist(), own.tolist()))
     record = io.read_garment(path)
     np.testing.assert_array_equal(record.vertices, apart)
-    assert record.welded == 0 and anatomy(record.vertices, record.faces).components == len(faces)
+    assert record.welded == 0 and summarise_surface(record.vertices, record.faces).components == len(faces)
     partly = io.read_garment(path, weld=1e-6)
-    assert anatomy(partly.vertices, partly.faces).components == 2
+    assert summarise_surface(partly.vertices, partly.faces).components == 2
     whole = io.read_garment(path, weld=5e-4)
-    assert whole.welded == len(apart) - len(x) and anatomy(whole.vertices, whole.faces).components == 1
+    assert whole.welded == len(apart) - len(x) and summarise_surface(whole.vertices, whole.faces).components == 1
     places = list(dict.fromkeys(faces.ravel().tolist()))  # each where it first stands in the file
     np.testing.assert_allclose(whole.vertices, x[places], atol=2e-4)
     np.testing.assert_array_equal(np.array(places)[whole.faces], faces)
@@ -269,7 +269,7 @@ def test_formats_that_split_vertices_are_welded_where_they_are_at_one_place(tmp_
     trimesh.Trimesh(*pieces(x, faces), process=False).export(tmp_path / f"g.{suffix}")
     record = io.read_garment(tmp_path / f"g.{suffix}")
     assert record.welded == 3 * len(faces) - len(x) - 3 + sum(np.sum(faces == v) == 1 for v in faces[-1])
-    assert anatomy(record.vertices, record.faces).components == 2
+    assert summarise_surface(record.vertices, record.faces).components == 2
     assert io.read_garment(tmp_path / f"g.{suffix}", weld=5e-4).vertices.shape == x.shape
 
 
@@ -278,19 +278,19 @@ def test_formats_that_split_vertices_are_welded_where_they_are_at_one_place(tmp_
 
 def test_anatomy():
     x, faces = tube()
-    found = anatomy(x, faces)
+    found = summarise_surface(x, faces)
     assert (found.components, found.loops, found.degenerate) == (1, 2, 0)
     x, faces = ball(1)
-    assert anatomy(x, faces).loops == 0
+    assert summarise_surface(x, faces).loops == 0
     pinched = faces[~(faces == 0).any(axis=1)]  # a hole where a vertex was
-    assert anatomy(x, pinched).loops == 1
+    assert summarise_surface(x, pinched).loops == 1
     x, faces = sheet(2, 3)
     both = np.concatenate([faces, faces + len(x)])
-    assert anatomy(np.concatenate([x, x + 1]), both).components == 2
+    assert summarise_surface(np.concatenate([x, x + 1]), both).components == 2
     # Two triangles that meet in a vertex alone: one piece, two borders that touch.
-    assert anatomy(np.eye(5)[:, :3], np.array([[0, 1, 2], [2, 3, 4]])).loops == 2
+    assert summarise_surface(np.eye(5)[:, :3], np.array([[0, 1, 2], [2, 3, 4]])).loops == 2
     flat = np.array([[0, 0, 0], [1, 0, 0], [2, 1e-7, 0], [1, 1, 0]], float)
-    assert anatomy(flat, np.array([[0, 1, 2], [0, 2, 3]])).degenerate == 1
+    assert summarise_surface(flat, np.array([[0, 1, 2], [0, 2, 3]])).degenerate == 1
 
 
 # --- units and axes ---------------------------------------------------------------------------------------------------------

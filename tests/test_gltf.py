@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import load_motion
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
-from ncs_jax.live import view
-from ncs_jax.scene import scene_from
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.scene.spec import scene_from
+from ncs_jax.view.live import view
 from tests import fbx_files
 from tests.characters import JOINTS, NAMES, figure, posed, rigid, skinned, write_glb
 from tests.scenes import SCENE

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble
 from ncs_jax.cli import main
-from ncs_jax.grading import RANGES, findings
-from ncs_jax.scene import load_scene
+from ncs_jax.prepare.scene_checks import RANGES, findings
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import load_scene
 
 from .scenes import SCENE, grid, swing, write_scene
 

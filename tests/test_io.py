@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.io.bvh import read_bvh
-from ncs_jax.scene import load_scene, template
+from ncs_jax.io.character.bvh import read_bvh
+from ncs_jax.scene.spec import load_scene, template
 from tests import fbx_files
 from tests.characters import write_glb
 from tests.conftest import THOROUGH
@@ -351,7 +351,7 @@ def test_a_kill_leaves_the_old_file(tmp_path):
     code = f"""
     import os, signal, numpy as np
     from ncs_jax import io
-    from ncs_jax.io import npz
+    from ncs_jax.io.tables import npz
     save = np.savez
     def half(stream, **arrays):
         save(stream, vertices=arrays["vertices"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms, unpose
+from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms, unpose
 
 from .shapes import rotation
 

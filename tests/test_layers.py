@@ -9,9 +9,11 @@ import pytest
 
 from ncs_jax import InputError, Run, assemble, load_run, load_scene, measure, simulate, train
 from ncs_jax.cli import main
-from ncs_jax.energies.collision import nearest_vertex, plane_distance, vertex_normals
-from ncs_jax.model import pose_body
-from ncs_jax.preview import worn_over
+from ncs_jax.energies.contact.distance import plane_distance
+from ncs_jax.energies.contact.nearest import nearest_vertex
+from ncs_jax.energies.contact.surface import vertex_normals
+from ncs_jax.scene.model import pose_body
+from ncs_jax.view.preview import worn_over
 
 from .scenes import SCENE, write_scene
 from .shapes import tube

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from ncs_jax import InputError, io, train
-from ncs_jax.live import BINS, COLOURS, View, colour_bins, measured, shown, view
-from ncs_jax.motion import Track
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.view.live import BINS, COLOURS, View, colour_bins, measured, shown, view
 
 from .scenes import write_scene
 from .test_viewer import BROWSER
@@ -43,7 +43,7 @@ def test_a_scene_is_shown_as_the_body_carries_it(carried):
 def test_colours_are_of_what_they_say(carried):
     run, name = carried.run, carried.motions[0]
     x, track = carried.animate(name, 1.0), carried.run.track(name)
-    assert isinstance(track, Track)
+    assert isinstance(track, MotionFeatures)
     stretched = x.copy()
     stretched[0] = x[0].mean(axis=0) + 1.2 * (x[0] - x[0].mean(axis=0))
     np.testing.assert_allclose(measured("strain", run, stretched, track, 0, None), 20, rtol=1e-3)

@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 
 from ncs_jax.errors import InputError
-from ncs_jax.lowering import RULES, onnx_model
+from ncs_jax.export.onnx_lowering import RULES, onnx_model
 
 HALF = np.linspace(-1, 1, 12, dtype=np.float16).reshape(4, 3)
 TABLE = np.linspace(-2, 3, 24, dtype=np.float32).reshape(2, 3, 4)

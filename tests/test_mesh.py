@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.mesh import dihedral, material_axes, mesh_from, topology, vertex_rings
+from ncs_jax.geometry.mesh import dihedral, material_axes, mesh_from, topology, vertex_rings
 
 from .shapes import ball, bracket, equilateral, rotation, sheet, tube
 

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from ncs_jax import load_run, train
-from ncs_jax.assembly import track_of
-from ncs_jax.compression import compress
-from ncs_jax.methods.ncs import NCS
-from ncs_jax.methods.pbns import PBNS
-from ncs_jax.methods.shared import Method
-from ncs_jax.methods.snug import SNUG
-from ncs_jax.methods.swing import Swing
-from ncs_jax.model import local_rotations
-from ncs_jax.objective import Frame, Terms, total
-from ncs_jax.rollout import stepper
-from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.energies.terms import StepInputs, Terms
+from ncs_jax.energies.total import total
+from ncs_jax.network.compression import compress
+from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.ncs import NCS
+from ncs_jax.network.methods.pbns import PBNS
+from ncs_jax.network.methods.snug import SNUG
+from ncs_jax.network.methods.swing import Swing
+from ncs_jax.network.rollout import stepper
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.model import local_rotations
+from ncs_jax.scene.spec import load_scene, scene_from
 
 from .scenes import write_scene
 from .test_rollout import edited, ready, run
@@ -32,7 +33,7 @@ def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, m
     assembly, params, motion = ready(tmp_path, method=method)
     network = assembly.network
     assert isinstance(network, METHODS[method]) and isinstance(network, Method)
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     whole, alike = compress(network, params, assembly.model, track, rank=16)
     expected = run(assembly, params, motion)
     for net, p, tolerance in ((network, params, 1e-12), (whole, alike, 1e-9)):
@@ -47,7 +48,7 @@ def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, m
 @pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])  # a swing is of the whole motion
 def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method):
     assembly, params, motion = ready(tmp_path, method=method)
-    track, ends = track_of(assembly.model, motion), jnp.array([5, 9], jnp.int32)
+    track, ends = features_from_records(assembly.model, motion), jnp.array([5, 9], jnp.int32)
     whole = assembly.network.codes(params, assembly.model, track)
     for of_all, of_windows in zip(whole, assembly.network.windows(params, track, ends, 10, 3), strict=True):
         assert (of_all is None) == (of_windows is None)
@@ -61,8 +62,8 @@ def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method)
 def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap(tmp_path):
     """Of two motions end to end, the second from rest again; of many frames and few windows, from the windows alone."""
     assembly, params, motion = ready(tmp_path, cell="linear")
-    once = assembly.network.codes(params, assembly.model, track_of(assembly.model, motion)).dynamic
-    track, frames = track_of(assembly.model, motion, motion), len(once)
+    once = assembly.network.codes(params, assembly.model, features_from_records(assembly.model, motion)).dynamic
+    track, frames = features_from_records(assembly.model, motion, motion), len(once)
     ends = jnp.arange(2 * frames, dtype=jnp.int32)
     found = assembly.network.windows(params, track, ends, 4, 3).dynamic
     for begin in (0, frames):
@@ -106,7 +107,7 @@ def test_where_inertia_has_a_gradient(tmp_path, method, rng):
     x = model.garment.mesh.rest[None] + jnp.asarray(rng.normal(0, 0.01, (3, *model.garment.mesh.rest.shape)))
 
     def energy(x):
-        return total(x[0], model.garment, model.material, Frame(1 / model.fps, x[1], x[2]), terms)
+        return total(x[0], model.garment, model.material, StepInputs(1 / model.fps, x[1], x[2]), terms)
 
     slope = jax.grad(energy)(x)
     away = np.asarray((x[0] - 2 * x[1] + x[2]) * model.fps**2)

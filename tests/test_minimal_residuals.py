@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble
-from ncs_jax.io.npz import write_npz
-from ncs_jax.scene import scene_from
-from ncs_jax.simulator import simulate, simulator_from
-from ncs_jax.solver.minimal_residuals import minimal_residuals
-from ncs_jax.solver.minimise import CONVERGED, Settings
+from ncs_jax.io.tables.npz import write_npz
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import scene_from
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
+from ncs_jax.simulation.solver.minimal_residuals import minimal_residuals
+from ncs_jax.simulation.solver.minimise import CONVERGED, Settings
 
 from .shapes import sheet
 

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.assembly import assemble
-from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
-from ncs_jax.mesh import topology
-from ncs_jax.model import local_rotations, pose_body, smooth_weights, touchable, transfer_weights, used_joints
-from ncs_jax.rotations import axis_angle_to_matrix
-from ncs_jax.scene import load_scene
+from ncs_jax.geometry.mesh import topology
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
+from ncs_jax.prepare.touchable import touchable
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import local_rotations, pose_body
+from ncs_jax.scene.spec import load_scene
 
 from .scenes import post, write_scene
 from .shapes import ball, rotation, sheet

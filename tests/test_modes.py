@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ncs_jax.mesh import mesh_from
-from ncs_jax.modes import laplacian, modal_basis
+from ncs_jax.geometry.laplacian_modes import laplacian, modal_basis
+from ncs_jax.geometry.mesh import mesh_from
 
 from .shapes import ball, equilateral, rotation, sheet, tube
 

@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.assembly import assemble, track_of
-from ncs_jax.dynamics import dynamics
-from ncs_jax.evaluation import measure
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, transforms
 from ncs_jax.io import MotionRecord
-from ncs_jax.kinematics import Skeleton, blend, blend_from, forward, skin, transforms
-from ncs_jax.methods.shared import initial_parameters
-from ncs_jax.motion import input_joints, mirror, track
-from ncs_jax.rollout import animate
-from ncs_jax.rotations import axis_angle_to_matrix
-from ncs_jax.scene import load_scene
-from ncs_jax.simulator import simulate, simulator_from
+from ncs_jax.metrics.motion import measure_motion
+from ncs_jax.metrics.quality import measure
+from ncs_jax.network.methods.method import initial_parameters
+from ncs_jax.network.rollout import animate
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.features import input_joints, mirror, motion_features
+from ncs_jax.scene.spec import load_scene
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
 
 from .scenes import write_scene
 
@@ -113,7 +114,7 @@ def wander(rng, frames):
 def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng):
     model = ready(tmp_path)
     records = [wander(rng, n) for n in (6, 6)]
-    together, alone = track_of(model, *records), [track_of(model, r) for r in records]
+    together, alone = features_from_records(model, *records), [features_from_records(model, r) for r in records]
     np.testing.assert_array_equal(together.start, np.repeat([0, 6], 6))
     assert together.start.dtype == jnp.int32
     for name in ("static", "dynamic", "matrices"):
@@ -123,7 +124,8 @@ def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng):
     for first in (0, 6):
         np.testing.assert_array_equal(together.dynamic[first], 0)
     assert np.abs(np.asarray(together.dynamic[1:6])).max(axis=(1, 2)).min() > 1e-3
-    as_one = track_of(model, MotionRecord(*(np.concatenate([getattr(r, n) for r in records]) for n in ("poses", "translation")),
+    joined = [np.concatenate([getattr(r, n) for r in records]) for n in ("poses", "translation")]
+    as_one = features_from_records(model, MotionRecord(*joined,
                                           30.0, ()))  # fmt: skip
     assert np.abs(np.asarray(as_one.dynamic - together.dynamic))[6].max() > 1e-2
 
@@ -135,7 +137,7 @@ def test_a_character_stood_still_before_its_first_frame(tmp_path, rng):
         np.concatenate([np.repeat(record.poses[:1], 6, axis=0), record.poses]),
         np.concatenate([np.repeat(record.translation[:1], 6, axis=0), record.translation]), 30.0, (),
     )  # fmt: skip
-    plain, after = track_of(model, record), track_of(model, rested)
+    plain, after = features_from_records(model, record), features_from_records(model, rested)
     np.testing.assert_allclose(after.dynamic[6:], plain.dynamic, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(after.dynamic[:6], 0)
 
@@ -143,8 +145,8 @@ def test_a_character_stood_still_before_its_first_frame(tmp_path, rng):
 def test_a_frame_is_described_by_itself_and_the_two_before(tmp_path, rng):
     model = ready(tmp_path)
     record = wander(rng, 12)
-    whole = track_of(model, record)
-    piece = track_of(model, MotionRecord(record.poses[4:10], record.translation[4:10], 30.0, ()))
+    whole = features_from_records(model, record)
+    piece = features_from_records(model, MotionRecord(record.poses[4:10], record.translation[4:10], 30.0, ()))
     np.testing.assert_allclose(piece.static, whole.static[4:10], rtol=0, atol=1e-13)
     np.testing.assert_allclose(piece.matrices, whole.matrices[4:10], rtol=0, atol=1e-13)
     np.testing.assert_allclose(piece.dynamic[2:], whole.dynamic[6:10], rtol=0, atol=1e-12)
@@ -154,7 +156,7 @@ def test_a_frame_is_described_by_itself_and_the_two_before(tmp_path, rng):
 def test_matrices_carry_rest_points_to_the_pose(tmp_path, rng):
     model = ready(tmp_path)
     record = wander(rng, 6)
-    matrices = np.asarray(track_of(model, record).matrices)
+    matrices = np.asarray(features_from_records(model, record).matrices)
     local = axis_angle_to_matrix(jnp.asarray(record.poses))
     pose = forward(model.skeleton, local, jnp.asarray(record.translation))
     joints = np.asarray(model.skeleton.joints)
@@ -174,7 +176,7 @@ def test_the_network_reads_its_input_joints_in_order(tmp_path, rng, inputs):
     for name, source in (("local", local[2]), ("world", one.rotations), ("positions", one.positions)):
         np.testing.assert_array_equal(getattr(joints, name), np.asarray(source)[list(inputs)])
     start = jnp.zeros(3, jnp.int32)
-    assert track(model, local, jnp.asarray(record.translation), start).static.shape == (3, len(inputs), 9)
+    assert motion_features(model, local, jnp.asarray(record.translation), start).static.shape == (3, len(inputs), 9)
 
 
 # --- far from the origin ------------------------------------------------------------------------------------------------
@@ -194,13 +196,13 @@ def elsewhere(record, way):
 
 def test_near_the_origin_nothing_is_shifted(wearer):
     a, record = wearer
-    assert track_of(a.model, record).origin is None
+    assert features_from_records(a.model, record).origin is None
 
 
 @pytest.mark.parametrize("way", [(1e4, 0.0, 0.0), (-6e3, 2e3, 7e3)])
 def test_far_from_the_origin_is_as_fine_as_near(wearer, way):
     a, record = wearer
-    here, there = track_of(a.model, record), track_of(a.model, elsewhere(record, way))
+    here, there = features_from_records(a.model, record), features_from_records(a.model, elsewhere(record, way))
     for name in ("static", "dynamic", "matrices"):
         np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=0, atol=1e-5)
     np.testing.assert_array_equal(there.origin, np.tile(way, (len(record.poses), 1)))
@@ -209,14 +211,14 @@ def test_far_from_the_origin_is_as_fine_as_near(wearer, way):
 def test_what_is_far_is_animated_measured_and_simulated_there(wearer):
     a, record = wearer
     way = np.array([8e3, 0.0, -1.6e3])
-    here, there = track_of(a.model, record), track_of(a.model, elsewhere(record, way))
+    here, there = features_from_records(a.model, record), features_from_records(a.model, elsewhere(record, way))
     params = initial_parameters(a.network, jax.random.PRNGKey(0), a.model)
     x, far = (np.asarray(animate(a.model, a.network, params, t), np.float64) for t in (here, there))
     np.testing.assert_allclose(far - way, x, rtol=0, atol=1e-3)  # what float32 tells apart 8 km away
     rows, others = measure(a.model, x.astype(np.float32), here), measure(a.model, x + way, there)
     for name, values in rows.items():
         np.testing.assert_allclose(others[name], values, rtol=1e-3, atol=1e-6)
-    moving = [dynamics(a.model, v, t) for v, t in ((x, here), (x + way, there))]
+    moving = [measure_motion(a.model, v, t) for v, t in ((x, here), (x + way, there))]
     for name, value in moving[0].items():
         assert moving[1][name] == pytest.approx(value, rel=1e-3, abs=1e-3)
     short = [jax.tree.map(lambda v: v[:3], t) for t in (here, there)]

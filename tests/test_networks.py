@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.networks import Decoder, DynamicEncoder, LinearEncoder, StaticEncoder, merge, recurrence
+from ncs_jax.network.decoder import Decoder, merge
+from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder, StaticEncoder, recurrence
 
 JOINTS, NUMBERS, STATE = 5, 12, 24
 every_dtype = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

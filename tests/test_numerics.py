@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.numerics import angle_between, norm, normalize, positive_part, signed_angle
+from ncs_jax.geometry.numerics import angle_between, norm, normalize, positive_part, signed_angle
 
 # Lengths of the odd row in m: nothing, the least number, just under and over where each type is masked, cloth, large.
 LENGTHS = [0.0, 1e-44, 0.9e-12, 1.1e-12, 1e-11, 1e-10, 1e-9, 1e-7, 1e-5, 1e-3, 1.0, 1e4]

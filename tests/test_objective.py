@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.energies.proximity import groups_from
-from ncs_jax.kinematics import unpose
-from ncs_jax.mesh import mesh_from
-from ncs_jax.objective import MEMBRANES, Frame, Garment, Material, Terms, distances, elastic, energies, total
+from ncs_jax.energies.contact.pairs import groups_from
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.elements import elastic
+from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import distances, energies, total
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.geometry.skinning import unpose
 
 from .shapes import ball, rotation, sheet
 
@@ -54,7 +56,7 @@ def situation():
     mesh = mesh_from(rest, faces, dtype=jnp.float64)
     garment = Garment(mesh, jnp.array([0, 5], jnp.int32), groups_from(mesh))
     turn = np.concatenate([rotation([1, 2, 3], 0.2), [[0.01], [0.0], [0.02]]], axis=1)
-    frame = Frame(
+    frame = StepInputs(
         dt=DT,
         previous=jnp.asarray(x + 3e-4 * rng.normal(size=x.shape)),
         before=jnp.asarray(x + 3e-4 * rng.normal(size=x.shape)),
@@ -147,7 +149,7 @@ def test_too_many_pairs_are_no_number():
     mesh = mesh_from(rest, faces, dtype=jnp.float64)
     garment = Garment(mesh, jnp.zeros(0, jnp.int32), groups_from(mesh))
     terms = dataclasses.replace(ALL, **{**OFF, "self_contact": True})
-    value = jax.jit(lambda x: total(x, garment, material(), Frame(), terms))
+    value = jax.jit(lambda x: total(x, garment, material(), StepInputs(), terms))
     assert value(0.8 * mesh.rest) > 0
     assert jnp.isnan(value(0.001 * mesh.rest))
 
@@ -201,7 +203,7 @@ def test_elements_differentiated_by_themselves_are_the_gradient_of_the_whole(mod
     terms = dataclasses.replace(ALL, **{**OFF, "membrane": model, "bending": True})
     poses = x[..., None] + 1e-3 * jnp.asarray(rng.normal(size=(*x.shape, 3)), dtype)
     parts, gradient = jax.jit(lambda x: elastic(x, garment, numbers, terms))(poses)
-    alone = jax.jit(jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, Frame(), terms).values())))
+    alone = jax.jit(jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, StepInputs(), terms).values())))
     for i in range(3):
         value, slope = alone(poses[..., i])
         eps = jnp.finfo(dtype).eps
@@ -248,7 +250,7 @@ def test_only_the_last_frame_of_a_trajectory_is_pulled():
 
     def value(shared, held):
         xs = [x + w * jnp.where(held[k], jax.lax.stop_gradient(shared), shared) for k, w in enumerate((1.0, 2.0, -3.0))]
-        return total(xs[0], garment, material(), Frame(DT, xs[1], xs[2]), terms)
+        return total(xs[0], garment, material(), StepInputs(DT, xs[1], xs[2]), terms)
 
     shared = jnp.asarray(np.random.default_rng(2).normal(size=x.shape)) * 1e-3
     slope = jax.jit(jax.grad(value))
@@ -336,7 +338,7 @@ def test_the_world_may_be_turned():
     turn = rotation([1, 1, -2], 1.9)
     move = lambda a: a @ turn.T  # noqa: E731
     blended = jnp.einsum("ab,vbc->vac", turn, frame.blended)
-    there = Frame(frame.dt, move(frame.previous), move(frame.before), move(frame.body), blended)
+    there = StepInputs(frame.dt, move(frame.previous), move(frame.before), move(frame.body), blended)
     here, _, pull = compiled(x, material(), frame, surface)
     other, _, turned_pull = compiled(move(x), material(gravity=turn @ DOWN), there, surface)
     np.testing.assert_allclose(other, here, rtol=1e-11)
@@ -362,5 +364,7 @@ def test_the_type_of_the_operands_is_kept(plain_jax):
     x = jnp.asarray(rest * 1.1, jnp.float32)
     blended = jnp.broadcast_to(jnp.eye(3, 4), (9, 3, 4))
     terms = Terms(collision=None, pinning=True)
-    value = total(x, garment, jax.tree.map(lambda a: a.astype(jnp.float32), material()), Frame(DT, x, x, None, blended), terms)
+    value = total(
+        x, garment, jax.tree.map(lambda a: a.astype(jnp.float32), material()), StepInputs(DT, x, x, None, blended), terms
+    )
     assert value.dtype == jnp.float32 and jnp.isfinite(value)

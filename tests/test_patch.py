@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.smooth_contact import nearby_quadrics
-from ncs_jax.model import pose_body
-from ncs_jax.simulator import simulator_from
-from ncs_jax.solver import minimise
-from ncs_jax.solver import problem as frame
-from ncs_jax.solver.patch import SIZE, patch_around, solve_dense
+from ncs_jax.energies.contact.smooth import nearby_quadrics
+from ncs_jax.scene.model import pose_body
+from ncs_jax.simulation.implicit_euler import simulator_from
+from ncs_jax.simulation.solver import minimise
+from ncs_jax.simulation.solver import problem as frame
+from ncs_jax.simulation.solver.patch import SIZE, patch_around, solve_dense
 
 from .scenes import grid
 from .test_simulator import written

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ncs_jax import pictures
 from ncs_jax.errors import InputError
-from ncs_jax.pictures import Camera, Ground, Mesh, render
-from ncs_jax.rasteriser import PAPER
+from ncs_jax.view import curves, pictures
+from ncs_jax.view.rasteriser import PAPER, Camera, DrawnMesh, Ground, render
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
 
@@ -70,7 +69,7 @@ def hue(picture: np.ndarray) -> str:
 @pytest.mark.parametrize("gap", [0.003, -0.003])
 def test_three_millimetres_decide_what_is_seen(fov: float, gap: float):
     camera = Camera((0.0, 0.0, 0.0), 1.2, elevation=0.0, fov=fov)
-    meshes = [Mesh(*square(gap), RED), Mesh(*square(0.0), GREEN)]
+    meshes = [DrawnMesh(*square(gap), RED), DrawnMesh(*square(0.0), GREEN)]
     for order in (meshes, meshes[::-1]):
         assert hue(render(order, camera, (60, 60))) == ("R" if gap > 0 else "G")
 
@@ -79,20 +78,20 @@ def test_depth_is_compared_at_each_pixel():
     """Two squares that cross: painting the farther one first would get one half wrong."""
     vertices, faces = square(0.0)
     leaning = vertices + np.outer(vertices[:, 0], [0.0, 0.0, 0.4])
-    picture = render([Mesh(vertices, faces, RED), Mesh(leaning, faces, GREEN)], CAMERA, (80, 80)).astype(int)
+    picture = render([DrawnMesh(vertices, faces, RED), DrawnMesh(leaning, faces, GREEN)], CAMERA, (80, 80)).astype(int)
     left, right = picture[40, 20], picture[40, 60]
     assert left.argmax() == 0 and right.argmax() == 1
 
 
 def test_neighbours_leave_no_crack():
     vertices, faces = tube(40, 60, 0.4, -0.5, 0.5)
-    picture = render([Mesh(vertices, faces, RED)], CAMERA, (120, 120), samples=1).astype(int)
+    picture = render([DrawnMesh(vertices, faces, RED)], CAMERA, (120, 120), samples=1).astype(int)
     inner = picture[20:100, 30:90]
     assert (inner[..., 0] - inner[..., 2] > 20).all()
 
 
 def test_the_picture_has_the_size_and_place_asked_for():
-    picture = render([Mesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 1.0, elevation=0.0, fov=0.0), (50, 100))
+    picture = render([DrawnMesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 1.0, elevation=0.0, fov=0.0), (50, 100))
     assert picture.shape == (100, 50, 3) and picture.dtype == np.uint8
     rows, columns = np.nonzero((picture != PAPER).any(2))
     assert (rows.min(), rows.max() + 1) == (20, 80)
@@ -100,7 +99,7 @@ def test_the_picture_has_the_size_and_place_asked_for():
 
 
 def test_width_in_sight_counts_too():
-    picture = render([Mesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 0.1, 1.0, elevation=0.0, fov=0.0), (100, 50))
+    picture = render([DrawnMesh(*square(0.0, 0.3), RED)], Camera((0.0, 0.0, 0.0), 0.1, 1.0, elevation=0.0, fov=0.0), (100, 50))
     columns = np.nonzero((picture != PAPER).any(2))[1]
     assert (columns.min(), columns.max() + 1) == (20, 80)
 
@@ -113,15 +112,15 @@ def test_views_look_from_where_they_say(view: str, axis: int):
 
 def test_the_inside_has_its_own_colour():
     vertices, faces = square(0.0)
-    assert hue(render([Mesh(vertices, faces, RED, GREEN)], CAMERA, (40, 40))) == "R"
-    assert hue(render([Mesh(vertices, faces[:, ::-1], RED, GREEN)], CAMERA, (40, 40))) == "G"
-    assert hue(render([Mesh(vertices, faces[:, ::-1], RED)], CAMERA, (40, 40))) == "R"
+    assert hue(render([DrawnMesh(vertices, faces, RED, GREEN)], CAMERA, (40, 40))) == "R"
+    assert hue(render([DrawnMesh(vertices, faces[:, ::-1], RED, GREEN)], CAMERA, (40, 40))) == "G"
+    assert hue(render([DrawnMesh(vertices, faces[:, ::-1], RED)], CAMERA, (40, 40))) == "R"
 
 
 def test_colours_can_differ_by_vertex():
     vertices, faces = square(0.0)
     colour = np.where(vertices[:, :1] < 0, RED, GREEN)
-    picture = render([Mesh(vertices, faces, colour)], CAMERA, (60, 60)).astype(int)
+    picture = render([DrawnMesh(vertices, faces, colour)], CAMERA, (60, 60)).astype(int)
     assert picture[30, 10].argmax() == 0 and picture[30, 50].argmax() == 1
 
 
@@ -130,23 +129,23 @@ def test_what_is_not_finite_is_left_out(bad: float):
     vertices, faces = square(0.0)
     other, _ = square(0.1)
     other[0, 1] = bad
-    picture = render([Mesh(vertices, faces, RED), Mesh(other, faces, GREEN)], CAMERA, (60, 60), ground=Ground(-0.5))
+    picture = render([DrawnMesh(vertices, faces, RED), DrawnMesh(other, faces, GREEN)], CAMERA, (60, 60), ground=Ground(-0.5))
     assert hue(picture) == "R"
-    nothing = render([Mesh(np.full((4, 3), bad), faces, RED)], CAMERA, (60, 60), ground=Ground(-0.5))
+    nothing = render([DrawnMesh(np.full((4, 3), bad), faces, RED)], CAMERA, (60, 60), ground=Ground(-0.5))
     assert (nothing[:20] == PAPER).all()
     assert render([], CAMERA, (10, 10)).shape == (10, 10, 3)
 
 
 def test_degenerate_triangles_are_no_error():
     vertices = np.array([[0.0, 0, 0], [0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
-    assert (render([Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [1, 1, 1]]), RED)], CAMERA, (30, 30)) == PAPER).all()
+    assert (render([DrawnMesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [1, 1, 1]]), RED)], CAMERA, (30, 30)) == PAPER).all()
 
 
 def test_a_garment_that_blew_up_is_drawn_in_bounded_time(rng: np.random.Generator):
     vertices = rng.normal(size=(1000, 3)) * 3
     faces = rng.integers(0, 1000, (2000, 3))
     start = time.perf_counter()
-    render([Mesh(vertices, faces, RED)], Camera((0.0, 0.0, 0.0), 1.0), (400, 500))
+    render([DrawnMesh(vertices, faces, RED)], Camera((0.0, 0.0, 0.0), 1.0), (400, 500))
     assert time.perf_counter() - start < 20
 
 
@@ -154,7 +153,7 @@ def test_shadow_falls_on_the_ground():
     vertices, faces = tube(6, 20, 0.15, 0.05, 0.8)
     camera = Camera((0.0, 0.4, 0.0), 1.6, elevation=20.0)
     lit = render([], camera, (80, 80), ground=Ground(0.0, cell=0)).astype(int)
-    shaded = render([Mesh(vertices, faces, RED)], camera, (80, 80), ground=Ground(0.0, cell=0)).astype(int)
+    shaded = render([DrawnMesh(vertices, faces, RED)], camera, (80, 80), ground=Ground(0.0, cell=0)).astype(int)
     grey = np.ptp(shaded, axis=2) < 25  # the floor, not the tube
     assert (lit == PAPER).all()
     assert ((lit - shaded).min(2) > 20)[grey].sum() > 30
@@ -258,22 +257,22 @@ def test_energy_curves(tmp_path):
          "validation_total": "1.5" if i % 5 == 0 else "", "nonsense": "abc", "strain": "nan" if i == 3 else "1.0"}
         for i in range(30)
     ]  # fmt: skip
-    pictures.energy_curves(tmp_path / "a.png", rows)
+    curves.energy_curves(tmp_path / "a.png", rows)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.width > 1500
     text = ",".join(rows[0]) + "\n" + "\n".join(",".join(row.values()) for row in rows)
     (tmp_path / "log.csv").write_text(text)
-    pictures.energy_curves(tmp_path / "b.png", tmp_path / "log.csv")
+    curves.energy_curves(tmp_path / "b.png", tmp_path / "log.csv")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     with pytest.raises(InputError, match="rows"):
-        pictures.energy_curves(tmp_path / "c.png", [{"step": "1", "other": "2"}])
+        curves.energy_curves(tmp_path / "c.png", [{"step": "1", "other": "2"}])
 
 
 def test_matplotlib_stays_out_until_it_is_asked_for():
     pytest.importorskip("matplotlib")
     code = (
-        "import sys, io; from ncs_jax import pictures; early = 'matplotlib' in sys.modules;"
-        "pictures.energy_curves(io.BytesIO(), [{'step': 1, 'total': 2.0}]);"
+        "import sys, io; from ncs_jax.view import curves; early = 'matplotlib' in sys.modules;"
+        "curves.energy_curves(io.BytesIO(), [{'step': 1, 'total': 2.0}]);"
         "sys.exit(early or 'matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,14 +12,15 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ncs_jax.descriptors import DESCRIPTORS, Joints, dynamic, static
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.energies.proximity import groups_from
-from ncs_jax.kinematics import skin, unpose
-from ncs_jax.mesh import mesh_from
-from ncs_jax.networks import DynamicEncoder, LinearEncoder
-from ncs_jax.objective import Frame, Garment, Material, Terms, energies
-from ncs_jax.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_axis_angle
+from ncs_jax.energies.contact.pairs import groups_from
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import energies
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.geometry.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_axis_angle
+from ncs_jax.geometry.skinning import skin, unpose
+from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder
+from ncs_jax.scene.descriptors import DESCRIPTORS, Joints, dynamic, static
 from tests.conftest import THOROUGH
 from tests.shapes import ball, sheet, tube
 
@@ -112,7 +113,9 @@ def test_energy_and_two_derivatives_are_finite(term, seed, size, stiffness, dens
     blended = np.tile(np.eye(3, 4), (len(x), 1, 1))
     pressed = rng.standard_normal(x.shape) * rng.integers(0, 2, (len(x), 1))
     other = x + 0.01 * scale * rng.standard_normal(x.shape) * rng.integers(0, 2)
-    frame = Frame(single(1 / rate), single(other), single(x), single(BODY[0]), single(blended), single(other), single(pressed))
+    frame = StepInputs(
+        single(1 / rate), single(other), single(x), single(BODY[0]), single(blended), single(other), single(pressed)
+    )
     on = surface_of(terms.collision)
     values = derivatives(terms, single(x), single(rng.standard_normal(x.shape)), garment, numbers, frame, on)
     if term == "self_contact" and np.isnan(values[0]):
@@ -129,7 +132,7 @@ def surface_of(kind):
 
 @functools.partial(jax.jit, static_argnums=0)
 def slopes(terms, x, garment, numbers):
-    return jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, Frame(1 / 30), terms).values()))(x)
+    return jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, StepInputs(1 / 30), terms).values()))(x)
 
 
 @pytest.mark.parametrize("term", ["stvk", "neo_hookean", "baraff_witkin", "mass_spring", "bending"])

@@ -10,17 +10,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import load_motion
-from ncs_jax.casting import cast, lead
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
+from ncs_jax.geometry.skinning import to_rest_axes
 from ncs_jax.io import BodyRecord, MotionRecord
-from ncs_jax.io.smpl import smpl_names, smpl_parents
-from ncs_jax.joint_names import anatomy, pair
-from ncs_jax.kinematics import to_rest_axes
-from ncs_jax.preview import posed_body
-from ncs_jax.retarget import body_names, retarget, with_skeleton
-from ncs_jax.scene import MotionSpec, load_scene, packaged, scene_from
+from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.joint_names import anatomy, pair
+from ncs_jax.prepare.motion_import import lead, load_motion, retarget_to_body
+from ncs_jax.prepare.retarget import body_names, retarget, with_skeleton
+from ncs_jax.scene.spec import MotionSpec, load_scene, packaged, scene_from
+from ncs_jax.view.preview import posed_body
 
 CLIPS = ("10_01", "02_02", "03_03")
 
@@ -185,7 +184,7 @@ def test_the_packaged_body_and_motions_are_the_identity():
     assert turned.magnitude().max() < 1e-6 and not moved.still and not moved.unused and abs(moved.scale - 1) < 1e-6
     np.testing.assert_allclose(np.diff(moved.motion.translation - walk.translation, axis=0), 0, atol=1e-6)
     assert np.abs(moved.motion.translation - walk.translation).max() < 0.02
-    same = cast(walk, body, MotionSpec())
+    same = retarget_to_body(walk, body, MotionSpec())
     assert same.poses is walk.poses and same.translation is walk.translation and not same.notes
 
 
@@ -311,9 +310,9 @@ def test_poses_along_the_joints_own_axes_are_the_same_motion(rng):
     np.testing.assert_allclose(retarget(along, body).motion.translation, plain.translation, atol=1e-9)
     # the same skeleton needs no retargeting, but its axes may be others
     twin = body_of("mixamo")
-    np.testing.assert_allclose(cast(along, twin, MotionSpec()).poses, motion.poses, atol=1e-9)
+    np.testing.assert_allclose(retarget_to_body(along, twin, MotionSpec()).poses, motion.poses, atol=1e-9)
     turned = replace(twin, rest_rotations=own)
-    np.testing.assert_allclose(cast(along, turned, MotionSpec()).poses, along.poses, atol=1e-12)
+    np.testing.assert_allclose(retarget_to_body(along, turned, MotionSpec()).poses, along.poses, atol=1e-12)
 
 
 def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
@@ -336,7 +335,7 @@ def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
         retarget(motion, body, joints={"mixamorig:Head": "nose"})
     other = retarget(motion, body, joints={"nose": "mixamorig:Head"})  # of another motion of the scene, or a slip
     assert other.pairs == {n: n for n in body.joint_names} and any("has not: nose" in n for n in other.motion.notes)
-    own = cast(motion, body_of("mixamo"), MotionSpec(joints={"nose": "mixamorig:Head"}))
+    own = retarget_to_body(motion, body_of("mixamo"), MotionSpec(joints={"nose": "mixamorig:Head"}))
     assert np.array_equal(own.poses, motion.poses)
 
 
@@ -350,7 +349,7 @@ def test_what_cannot_be_retargeted_says_why(rng):
     ):
         with_skeleton(replace(motion, joints=None, parents=None), 7)
     with pytest.raises(InputError, match="2 joints"):
-        cast(MotionRecord(np.zeros((3, 2, 3)), np.zeros((3, 3)), 30.0), body, MotionSpec())
+        retarget_to_body(MotionRecord(np.zeros((3, 2, 3)), np.zeros((3, 3)), 30.0), body, MotionSpec())
 
 
 def test_what_leads_into_a_motion_is_left_out(rng):
@@ -363,9 +362,9 @@ def test_what_leads_into_a_motion_is_left_out(rng):
         led = replace(motion, poses=poses)
         assert lead(led) == leap and lead(replace(led, poses=poses[:15])) == 0
         body = body_of("smpl")
-        fitted = cast(led, body, MotionSpec())
+        fitted = retarget_to_body(led, body, MotionSpec())
         assert len(fitted.poses) == 100 - leap and "left out" in fitted.notes[0]
-        assert len(cast(led, body, MotionSpec(frames=(0,))).poses) == 100
+        assert len(retarget_to_body(led, body, MotionSpec(frames=(0,))).poses) == 100
     assert all(lead(io.read_motion(packaged(n))) == 0 for n in ("walk", "jump", "dance", "mixed", "twist"))
 
 

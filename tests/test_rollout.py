@@ -7,11 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import assemble, load_motion, track_of
-from ncs_jax.methods.shared import decode, for_inference, initial_parameters
-from ncs_jax.model import local_rotations
-from ncs_jax.rollout import animate, stepper
-from ncs_jax.scene import load_scene, scene_from
+from ncs_jax.network.methods.method import decode, for_inference, initial_parameters
+from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import local_rotations
+from ncs_jax.scene.spec import load_scene, scene_from
 
 from .scenes import write_scene
 
@@ -37,7 +39,7 @@ def ready(folder, dtype=jnp.float64, method="ncs", cell="gated"):
 
 
 def run(assembly, params, motion, alpha=1.0):
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     return np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, assembly.network, params, track, alpha))
 
 
@@ -61,7 +63,7 @@ def test_no_motion_has_no_dynamics(tmp_path):
 
 def test_alpha_zero_is_the_static_result(tmp_path):
     assembly, params, motion = ready(tmp_path)
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     static = jax.jit(animate, static_argnums=(1, 4))(assembly.model, assembly.network, params, track, None)
     np.testing.assert_allclose(run(assembly, params, motion, 0.0), static, rtol=0, atol=1e-14)
 
@@ -103,7 +105,7 @@ def test_a_stream_gives_what_the_sequence_gives(tmp_path, plain_jax, alpha):
 
 def test_many_characters_move_by_themselves(tmp_path, monkeypatch):
     """Five who begin at different frames, each with an alpha of its own, in blocks that do not divide them."""
-    monkeypatch.setattr("ncs_jax.rollout.BLOCK", 2)
+    monkeypatch.setattr("ncs_jax.network.rollout.BLOCK", 2)
     assembly, params, motion = ready(tmp_path)
     init, step = stepper(assembly.model, assembly.network, params)
     step = jax.jit(step)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from ncs_jax.rotations import (
+from ncs_jax.geometry.rotations import (
     axis_angle_to_matrix,
     axis_angle_to_quaternion,
     matrix_to_quaternion,

@@ -12,10 +12,11 @@ import jax
 import numpy as np
 import pytest
 
-from ncs_jax.devices import free_memory
 from ncs_jax.errors import InputError
-from ncs_jax.rollout import stepper
-from ncs_jax.runs import load_run, train
+from ncs_jax.network.rollout import stepper
+from ncs_jax.runs.run import load_run
+from ncs_jax.runs.train import train
+from ncs_jax.training.devices import free_memory
 
 from .scenes import write_scene
 
@@ -140,7 +141,7 @@ def test_minutes_choose_the_steps(tmp_path, plain_jax):
 
 def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_path, plain_jax, monkeypatch):
     scene, out = write_scene(tmp_path), tmp_path / "run"
-    monkeypatch.setattr("ncs_jax.devices.free_memory", lambda: 1000)
+    monkeypatch.setattr("ncs_jax.training.devices.free_memory", lambda: 1000)
     with pytest.raises(InputError, match=r"training.batch: training does not fit into memory.*1e-06 GB are free"):
         train(scene, out, steps=10)
     assert not out.exists() or not any(out.iterdir())

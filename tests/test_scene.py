@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from ncs_jax.errors import InputError
-from ncs_jax.scene import PRESETS, Scene, load_scene, scene_from, template
+from ncs_jax.scene.spec import PRESETS, Scene, load_scene, scene_from, template
 
 
 def write(folder, text):

@@ -10,20 +10,11 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear, nnls
 
-from ncs_jax.energies.proximity import (
-    corners_of,
-    edge_weights,
-    free_share,
-    groups_from,
-    intersecting,
-    nearby_pairs,
-    point_weights,
-    separation,
-    swept_share,
-    yielding,
-)
-from ncs_jax.energies.self_contact import barrier, blocks, energy, gradient, product, repulsion, self_contact
-from ncs_jax.mesh import mesh_from
+from ncs_jax.energies.contact.intersections import intersecting
+from ncs_jax.energies.contact.pairs import corners_of, edge_weights, groups_from, nearby_pairs, point_weights, separation
+from ncs_jax.energies.contact.safe_steps import free_share, swept_share, yielding
+from ncs_jax.energies.contact.self_contact import barrier, blocks, energy, gradient, product, repulsion, self_contact
+from ncs_jax.geometry.mesh import mesh_from
 
 from .shapes import rotation, sheet, tube
 

@@ -5,10 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from ncs_jax import InputError, io, simulate, simulation
+from ncs_jax import InputError, io, simulate
 from ncs_jax.cli import main
-from ncs_jax.scene import load_scene
-from ncs_jax.solver.minimise import CONVERGED
+from ncs_jax.runs import simulate as simulation
+from ncs_jax.scene.spec import load_scene
+from ncs_jax.simulation.solver.minimise import CONVERGED
 
 from .scenes import SCENE, write_scene
 

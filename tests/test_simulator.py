@@ -12,15 +12,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import assemble, track_of
-from ncs_jax.energies.collision import nearest_triangle, triangle_distance
-from ncs_jax.evaluation import measure
-from ncs_jax.kinematics import blend
-from ncs_jax.model import local_rotations, pose_body
-from ncs_jax.objective import Frame, total
-from ncs_jax.scene import load_scene, scene_from
-from ncs_jax.simulator import simulate, simulator_from, stepper
-from ncs_jax.solver.minimise import CONVERGED, LIMIT, NOT_FINITE, Settings
+from ncs_jax.energies.contact.distance import triangle_distance
+from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import total
+from ncs_jax.geometry.skinning import blend
+from ncs_jax.metrics.quality import measure
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import local_rotations, pose_body
+from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from, stepper
+from ncs_jax.simulation.solver.minimise import CONVERGED, LIMIT, NOT_FINITE, Settings
 
 from .scenes import grid, post, swing, write_scene
 from .shapes import tube
@@ -74,7 +77,7 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def moved(scene):
     assembly, simulator, motion = scene
-    track = track_of(assembly.model, motion)
+    track = features_from_records(assembly.model, motion)
     x, solution = run(simulator, track, SETTINGS)
     return np.asarray(x), solution, track
 
@@ -119,7 +122,7 @@ def test_a_character_that_stands_has_cloth_that_stands(scene, moved):
     """The first frame is the static state, so nothing moves after it."""
     assembly, simulator, motion = scene
     still = edited(motion, np.repeat(motion.poses[:1], 10, axis=0), np.repeat(motion.translation[:1], 10, axis=0))
-    x, solution = run(simulator, track_of(assembly.model, still), SETTINGS)
+    x, solution = run(simulator, features_from_records(assembly.model, still), SETTINGS)
     np.testing.assert_allclose(x[1:], np.broadcast_to(x[:1], x[1:].shape), rtol=0, atol=1e-6)
     assert not np.asarray(solution.iterations)[1:].any()  # already solved
     np.testing.assert_allclose(x[0], moved[0][0], rtol=0, atol=1e-12)
@@ -136,7 +139,7 @@ def test_a_stream_gives_what_the_sequence_gives_and_no_step_raises_the_energy(sc
 
     @jax.jit
     def energy(x, previous, before, body, blended):
-        frame = Frame(1 / model.fps, previous, before, body, blended)
+        frame = StepInputs(1 / model.fps, previous, before, body, blended)
         return total(x, model.garment, model.material, frame, model.terms, model.surface)
 
     state = stepper(simulator, SETTINGS).init()
@@ -161,7 +164,7 @@ def test_turning_the_world_turns_the_cloth(scene, moved):
     poses[:, 0] = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
     root = assembly.body.joints[0]
     there = edited(motion, poses, turn.apply(motion.translation + root) - root)
-    x, solution = run(simulator, track_of(assembly.model, there), SETTINGS)
+    x, solution = run(simulator, features_from_records(assembly.model, there), SETTINGS)
     assert np.all(np.asarray(solution.status) == CONVERGED)
     np.testing.assert_allclose(x, moved[0] @ turn.as_matrix().T, rtol=0, atol=1e-6)
 
@@ -169,7 +172,7 @@ def test_turning_the_world_turns_the_cloth(scene, moved):
 def test_the_order_of_the_vertices_does_not_matter(tmp_path, moved):
     new = np.random.default_rng(4).permutation(72)
     assembly = sleeve(tmp_path, new=new)
-    track = track_of(assembly.model, next(iter(assembly.motions.values())))
+    track = features_from_records(assembly.model, next(iter(assembly.motions.values())))
     x, _ = run(simulator_from(assembly.model), track, SETTINGS)
     np.testing.assert_allclose(x, moved[0][:, new], rtol=0, atol=1e-6)
 
@@ -178,7 +181,7 @@ def test_single_precision(tmp_path, moved, plain_jax):
     """Near the exact motion, and said to be solved; at 0.003 g, for what is left over 10 frames grows with the tolerance."""
     assembly = sleeve(tmp_path, jnp.float32)
     motion = next(iter(assembly.motions.values()))
-    x, solution = run(simulator_from(assembly.model), track_of(assembly.model, motion), Settings(tolerance=0.003))
+    x, solution = run(simulator_from(assembly.model), features_from_records(assembly.model, motion), Settings(tolerance=0.003))
     assert x.dtype == jnp.float32 and solution.residual.dtype == jnp.float32
     assert np.all(np.asarray(solution.status) == CONVERGED)
     np.testing.assert_allclose(np.asarray(x), moved[0], rtol=0, atol=1e-3)
@@ -190,7 +193,7 @@ def test_a_character_far_away_is_solved_as_one_at_home(tmp_path, plain_jax):
     motion, simulator = next(iter(assembly.motions.values())), simulator_from(assembly.model)
     ends, away = [], np.array([48.0, 0.0, -16.0])
     for shift in (0 * away, away):
-        track = track_of(assembly.model, edited(motion, motion.poses, motion.translation + shift))
+        track = features_from_records(assembly.model, edited(motion, motion.poses, motion.translation + shift))
         x, solution = run(simulator, track, Settings(tolerance=0.05))
         assert np.all(np.asarray(solution.status) == CONVERGED)
         ends.append(np.asarray(x, np.float64) - shift)
@@ -201,7 +204,7 @@ def test_motions_in_a_batch_equal_the_loop(scene, moved):
     """A batch waits for its slowest, and what is done is left alone."""
     assembly, simulator, motion = scene
     slow = edited(motion, 0.5 * motion.poses, 0.5 * motion.translation)
-    tracks = [track_of(assembly.model, m) for m in (motion, slow)]
+    tracks = [features_from_records(assembly.model, m) for m in (motion, slow)]
     whole = jax.jit(jax.vmap(lambda matrices: simulate(simulator, replace(tracks[0], matrices=matrices), SETTINGS)))
     x, solution = whole(jnp.stack([track.matrices for track in tracks]))
     np.testing.assert_allclose(x[0], moved[0], rtol=0, atol=1e-8)

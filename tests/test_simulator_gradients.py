@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble, track_of
-from ncs_jax.scene import load_scene
-from ncs_jax.simulator import simulate, simulator_from
-from ncs_jax.solver.minimise import CONVERGED, Settings
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import load_scene
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
+from ncs_jax.simulation.solver.minimise import CONVERGED, Settings
 
 from .scenes import SCENE, write_scene
 
@@ -30,7 +31,7 @@ def scene(tmp_path, contact, friction):
     assembly = assemble(load_scene(write_scene(tmp_path, text)), dtype=jnp.float64)
     model = assembly.model
     if contact:
-        track = track_of(model, assembly.motions["swing.npz"])
+        track = features_from_records(model, assembly.motions["swing.npz"])
         return simulator_from(model), jax.tree.map(lambda a: a[:5], track)
     track = assembly.track  # a character that never moves is one frame long
     return simulator_from(replace(model, moves=True)), jax.tree.map(lambda a: jnp.repeat(a, 5, axis=0), track)

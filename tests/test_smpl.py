@@ -15,12 +15,11 @@ import scipy.sparse
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.assembly import load_motion
-from ncs_jax.casting import cast
 from ncs_jax.errors import InputError
-from ncs_jax.io.smpl import smpl_names, smpl_parents
-from ncs_jax.retarget import with_skeleton
-from ncs_jax.scene import MotionSpec, packaged, scene_from
+from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.motion_import import load_motion, retarget_to_body
+from ncs_jax.prepare.retarget import with_skeleton
+from ncs_jax.scene.spec import MotionSpec, packaged, scene_from
 from tests.test_retarget import body_of, directions, forward
 
 UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from Z up to Y up
@@ -159,7 +158,7 @@ def test_a_pickle_is_refused_and_its_conversion_works(tmp_path, rng):
 def test_motions_drive_each_others_bodies(tmp_path, rng, ours, theirs):
     fields = motion(rng, theirs)
     record = io.read_motion(save(tmp_path / "m.npz", fields))
-    moved = cast(record, body(rng, ours), MotionSpec())
+    moved = retarget_to_body(record, body(rng, ours), MotionSpec())
     given, a, b = fields["poses"].reshape(6, theirs, 3), smpl_names(ours), smpl_names(theirs)
     for j, name in enumerate(a):
         assert np.array_equal(moved.poses[:, j], given[:, b.index(name)] if name in b else np.zeros((6, 3))), name
@@ -172,10 +171,10 @@ def test_motions_drive_each_others_bodies(tmp_path, rng, ours, theirs):
 def test_other_counts_are_refused_by_a_body_without_names(tmp_path, rng):
     record = io.read_motion(save(tmp_path / "m.npz", motion(rng, 23)))
     with pytest.raises(InputError, match=r"poses: the body's 24 joints expected.*23 joints"):
-        cast(record, body(rng, 24), MotionSpec())
+        retarget_to_body(record, body(rng, 24), MotionSpec())
     foreign = replace(body(rng, 24), parents=np.arange(-1, 23, dtype=np.int32))
     with pytest.raises(InputError, match="joint_names: a body with joint names"):
-        cast(io.read_motion(save(tmp_path / "n.npz", motion(rng, 52))), foreign, MotionSpec())
+        retarget_to_body(io.read_motion(save(tmp_path / "n.npz", motion(rng, 52))), foreign, MotionSpec())
 
 
 @pytest.mark.parametrize("joints", [24, 52])
@@ -186,19 +185,19 @@ def test_amass_is_turned_from_z_up(tmp_path, rng, joints, rate):
     record = io.read_motion(save(tmp_path / "m.npz", fields))
     assert record.up == "z" and record.fps == 120
     owner = body(rng, 24)
-    moved = cast(record, owner, MotionSpec())
-    stays = cast(record, owner, MotionSpec(up="y"))
+    moved = retarget_to_body(record, owner, MotionSpec())
+    stays = retarget_to_body(record, owner, MotionSpec(up="y"))
     assert moved.notes[-1:] == ("turned from Z up to Y up",) and "turned from Z up to Y up" not in stays.notes
     turns, places = forward(owner.joints, owner.parents, moved)
     theirs, there = forward(owner.joints, owner.parents, stays)
     np.testing.assert_allclose(places, there @ UP.T, atol=1e-9)
     np.testing.assert_allclose(turns, UP @ theirs, atol=1e-9)
     assert np.array_equal(
-        cast(record, owner, MotionSpec(), "z").translation, stays.translation
+        retarget_to_body(record, owner, MotionSpec(), "z").translation, stays.translation
     )  # gravity along z: nothing to do
     plain = io.read_motion(save(tmp_path / "n.npz", motion(rng, joints)))
-    assert plain.up == "" and np.array_equal(cast(plain, owner, MotionSpec()).translation, plain.translation)
-    both = cast(plain, owner, MotionSpec(up="z"))
+    assert plain.up == "" and np.array_equal(retarget_to_body(plain, owner, MotionSpec()).translation, plain.translation)
+    both = retarget_to_body(plain, owner, MotionSpec(up="z"))
     assert both.notes[-1] == "turned from Z up to Y up"
 
 
@@ -240,7 +239,7 @@ def test_a_motion_without_a_skeleton_is_a_persons_in_t_pose(tmp_path, rng):
     assert height["head"] > height["left_wrist"] == height["left_shoulder"] > height["pelvis"] > height["left_knee"]
     np.testing.assert_allclose(own.joints[own.joint_names.index("left_knee")] * (-1, 1, 1), own.joints[5])
     owner = body_of("mixamo", droop=0.8)
-    moved = cast(record, owner, MotionSpec())
+    moved = retarget_to_body(record, owner, MotionSpec())
     part = {"arm": 16, "forearm": 18, "hand": 20, "thigh": 1, "shin": 4, "foot": 7}
     _, places = forward(own.joints, own.parents, own)
     pairs = [("arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shin", "foot")]
@@ -254,7 +253,7 @@ def test_a_recorded_walk_drives_the_packaged_body_and_the_models(data, tmp_path,
     file = data / "smpl_research_only" / "01_01.npz"
     walk = io.read_motion(file)
     smpl = io.read_body(data / "smpl_research_only" / "body.npz")
-    same = cast(walk, smpl, MotionSpec())
+    same = retarget_to_body(walk, smpl, MotionSpec())
     assert np.array_equal(same.poses, walk.poses) and np.array_equal(same.translation, walk.translation) and not same.notes
     rig = io.read_body(packaged("body"))
     moved = load_motion(scene_from({"motion": {"files": [str(file)]}}, ""), str(file), rig)

@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble, track_of
-from ncs_jax.energies.proximity import groups_from, intersecting
-from ncs_jax.evaluation import measure
-from ncs_jax.kinematics import blend, skin
-from ncs_jax.scene import load_scene
-from ncs_jax.simulator import simulate, simulator_from
-from ncs_jax.solver.minimise import CONVERGED, LIMIT, Settings
+from ncs_jax.energies.contact.intersections import intersecting
+from ncs_jax.energies.contact.pairs import groups_from
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.metrics.quality import measure
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import load_scene
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
+from ncs_jax.simulation.solver.minimise import CONVERGED, LIMIT, Settings
 
 from .scenes import SCENE, grid, write_scene
 from .shapes import tube
@@ -28,7 +30,7 @@ run = jax.jit(simulate, static_argnums=2)
 def scene(tmp_path_factory):
     assembly = sleeve(tmp_path_factory.mktemp("sleeve"))
     motion = next(iter(assembly.motions.values()))
-    return simulator_from(assembly.model), jax.tree.map(lambda a: a[:4], track_of(assembly.model, motion))
+    return simulator_from(assembly.model), jax.tree.map(lambda a: a[:4], features_from_records(assembly.model, motion))
 
 
 def test_quasi_newton_comes_to_where_newton_comes(scene):
@@ -58,7 +60,7 @@ def thrown_by(folder, cloth, way):
     """A scene whose post goes `way` (frames,) along z, and its loose cloth, which rests before it does; and what is left."""
     assembly = written(folder, *cloth, collision={"distance": "smooth", "stiffness": 200.0})
     model = assembly.model
-    track = jax.tree.map(lambda a: a[: len(way)], track_of(model, next(iter(assembly.motions.values()))))
+    track = jax.tree.map(lambda a: a[: len(way)], features_from_records(model, next(iter(assembly.motions.values()))))
     start = jnp.zeros_like(track.matrices).at[:, :, 2, 3].set(way[:, None])
     track = replace(track, matrices=track.matrices[:1] + start)
     simulator = simulator_from(model)

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.kinematics import skin
-from ncs_jax.mesh import corners, dihedral, mesh_from
-from ncs_jax.objective import MEMBRANES, Frame, Garment, Terms, distances, total
-from ncs_jax.solver.contact import touching
-from ncs_jax.solver.stiffness import couplings_from, multiply, stiffness
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.terms import MEMBRANES, Garment, StepInputs, Terms
+from ncs_jax.energies.total import distances, total
+from ncs_jax.geometry.mesh import corners, dihedral, mesh_from
+from ncs_jax.geometry.skinning import skin
+from ncs_jax.simulation.solver.contact import touching
+from ncs_jax.simulation.solver.stiffness import couplings_from, multiply, stiffness
 
 from .shapes import ball, rotation, sheet, tube
 from .test_objective import material
@@ -67,7 +68,7 @@ def dense(couplings, diagonal, off):
 
 def assembled(x, shape, terms, *, numbers=None, frame=None, surface=None, seed=None):
     cloth, couplings = garment(shape, seed=seed)
-    found = blocks(jnp.asarray(x), couplings, cloth, numbers or material(terms.membrane), frame or Frame(), terms, surface)
+    found = blocks(jnp.asarray(x), couplings, cloth, numbers or material(terms.membrane), frame or StepInputs(), terms, surface)
     return dense(couplings, *found)
 
 
@@ -105,7 +106,7 @@ def test_matrix_is_symmetric_and_positive_semi_definite(model):
         size = np.abs(a).max()
         np.testing.assert_allclose(a, a.T, rtol=0, atol=1e-13 * size)
         assert np.linalg.eigvalsh(a)[0] >= -1e-12 * size, name
-        true = hessian(jnp.asarray(x @ TURN), garment("sheet")[0], material(model), Frame(), terms)
+        true = hessian(jnp.asarray(x @ TURN), garment("sheet")[0], material(model), StepInputs(), terms)
         indefinite += np.linalg.eigvalsh(np.asarray(true))[0] < -1e-3 * np.abs(true).max()
     assert indefinite >= 3  # else nothing had to be done
 
@@ -115,8 +116,8 @@ def test_blocks_are_finite_and_keep_the_type_in_single_precision(model):
     cloth, couplings = garment("sheet", jnp.float32)
     single = jax.tree.map(lambda a: a.astype(jnp.float32), material(model))
     for name, x in deformations().items():
-        found = blocks(jnp.asarray(x, jnp.float32), couplings, cloth, single, Frame(), of_membrane(model))
-        double = blocks(jnp.asarray(x), *garment("sheet")[::-1], material(model), Frame(), of_membrane(model))
+        found = blocks(jnp.asarray(x, jnp.float32), couplings, cloth, single, StepInputs(), of_membrane(model))
+        double = blocks(jnp.asarray(x), *garment("sheet")[::-1], material(model), StepInputs(), of_membrane(model))
         for got, exact in zip(found, double, strict=True):
             assert got.dtype == jnp.float32 and jnp.all(jnp.isfinite(got)), name
             if name in ("rest", "shaken", "squeezed in the plane"):
@@ -133,7 +134,7 @@ def test_in_tension_and_at_the_rest_angles_it_is_the_hessian(model, rng):
     noise = 1e-4 * rng.normal(size=ROUND.shape)
     for x, numbers in ((1.001 * ROUND, material(model)), (1.1 * ROUND + noise, soft)):
         x = x @ TURN + [0.3, 1.0, -0.2]
-        right = np.asarray(hessian(jnp.asarray(x), cloth, numbers, Frame(), terms))
+        right = np.asarray(hessian(jnp.asarray(x), cloth, numbers, StepInputs(), terms))
         assert np.linalg.eigvalsh(right)[0] > -1e-9 * np.abs(right).max()
         got = assembled(x, "tube", terms, numbers=numbers)
         np.testing.assert_allclose(got, right, rtol=0, atol=1e-6 * np.abs(right).max())
@@ -145,7 +146,7 @@ def test_it_is_never_less_than_the_hessian(model):
     terms = of_membrane(model)
     for name in ("shaken", "squeezed along the warp", "squeezed in the plane"):
         x = deformations()[name]
-        true = np.asarray(hessian(jnp.asarray(x), garment("sheet")[0], material(model), Frame(), terms))
+        true = np.asarray(hessian(jnp.asarray(x), garment("sheet")[0], material(model), StepInputs(), terms))
         difference = assembled(x, "sheet", terms) - true
         assert np.linalg.eigvalsh(difference)[0] > -1e-9 * np.abs(true).max(), name
 
@@ -161,7 +162,7 @@ def test_bending_is_the_square_of_the_angles_derivatives(rng):
     weight = 2 * 1e-5 * np.asarray(mesh.hinge_length) ** 2 / (8 * np.asarray(mesh.hinge_area).sum(axis=1))
     expected = np.asarray(slopes).T @ (weight[:, None] * np.asarray(slopes))
     np.testing.assert_allclose(assembled(x, "tube", terms), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    right = np.asarray(hessian(jnp.asarray(ROUND), garment("tube")[0], material(None), Frame(), terms))
+    right = np.asarray(hessian(jnp.asarray(ROUND), garment("tube")[0], material(None), StepInputs(), terms))
     np.testing.assert_allclose(assembled(ROUND, "tube", terms), right, rtol=0, atol=1e-9 * np.abs(right).max())
 
 
@@ -201,7 +202,7 @@ def on_a_ball():
     x = rest + 2e-3 * np.random.default_rng(4).normal(size=rest.shape)
     turn = 0.6 * rotation([1, 2, 3], 1.2) + 0.4 * rotation([0, 1, 0], -0.5)
     blended = jnp.broadcast_to(jnp.asarray(np.concatenate([turn, [[0.01], [0.0], [0.02]]], axis=1)), (20, 3, 4))
-    return jnp.asarray(x), Frame(body=jnp.asarray(body), blended=blended), surface_from(rest, body, triangles)
+    return jnp.asarray(x), StepInputs(body=jnp.asarray(body), blended=blended), surface_from(rest, body, triangles)
 
 
 def test_collision_with_planes_is_the_hessian():
@@ -221,7 +222,7 @@ def test_smooth_collision_is_the_hessian_on_a_plane(body, left_out):
     x, _, _ = on_a_ball()
     x = jnp.asarray(np.asarray(x) - np.asarray(x).mean(axis=0) + body.mean(axis=0) + [0, 0, 0.002])
     surface = surface_from(np.asarray(x), body, triangles, smooth=True)
-    terms, frame = dataclasses.replace(NOTHING, collision="smooth"), Frame(body=jnp.asarray(body))
+    terms, frame = dataclasses.replace(NOTHING, collision="smooth"), StepInputs(body=jnp.asarray(body))
     right = hessian(x, garment("sheet")[0], material(), frame, terms, surface)
     found = assembled(x, "sheet", terms, frame=frame, surface=surface)
     np.testing.assert_allclose(found, right, rtol=0, atol=left_out * np.abs(right).max())
@@ -307,4 +308,4 @@ def test_terms_add_up_and_nothing_is_nothing():
     np.testing.assert_allclose(whole, sum(parts), rtol=0, atol=1e-11 * np.abs(whole).max())
     # gravity is linear, and inertia is not in this matrix; a frame brings only what is asked for
     nothing = dataclasses.replace(NOTHING, gravity=True, inertia=True)
-    assert not assembled(x, "sheet", nothing, numbers=material(), frame=Frame()).any()
+    assert not assembled(x, "sheet", nothing, numbers=material(), frame=StepInputs()).any()

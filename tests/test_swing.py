@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 
 from ncs_jax import InputError, assemble, load_run, runs, train
-from ncs_jax.assembly import track_of
-from ncs_jax.kinematics import blend, skin
-from ncs_jax.methods.swing import QUIET, Swing
-from ncs_jax.model import local_rotations, pose_body
-from ncs_jax.objective import Frame, total
-from ncs_jax.rollout import animate, stepper
-from ncs_jax.scene import load_scene, scene_from
-from ncs_jax.simulator import simulate, simulator_from
-from ncs_jax.training import gradients, initial_state
-from ncs_jax.vibration import softest
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import total
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.network.methods.swing import QUIET, Swing
+from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.scene.model import local_rotations, pose_body
+from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.simulation.implicit_euler import simulate, simulator_from
+from ncs_jax.simulation.ritz_modes import softest_ritz_modes
+from ncs_jax.training.loss import gradients
+from ncs_jax.training.step import initial_state
 
 from .scenes import grid, write_scene
 from .test_rollout import edited, ready, run
@@ -45,7 +47,7 @@ def test_a_hanging_strip_swings_as_a_chain_does(tmp_path):
     assembly = hanging(tmp_path, 23, 5, 0.025)
     model = assembly.model  # of cloth that does not stretch, as chains do not
     model = replace(model, material=replace(model.material, membrane=tuple(30 * k for k in model.material.membrane)))
-    found = softest(model, assembly.track, 3)
+    found = softest_ritz_modes(model, assembly.track, 3)
     mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)
     moved = np.einsum("v,vik->ik", mass, np.square(found.directions))[:, 0]
     assert moved[2] > 0.999 * moved.sum()
@@ -57,11 +59,11 @@ def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
     """Orthogonal in mass and in stiffness, each of the same energy, as the second derivative of all terms has it."""
     assembly = hanging(tmp_path, 8)
     model, track, terms = assembly.model, assembly.track, replace(assembly.model.terms, inertia=False)
-    found = softest(model, track, 3)
+    found = softest_ritz_modes(model, track, 3)
     simulator = simulator_from(model)
     (x,), _ = jax.jit(simulate)(simulator, jax.tree.map(lambda a: a[:1], track))
     blended = blend(track.matrices[0], model.blend)
-    frame = Frame(1 / model.fps, blended=blended)
+    frame = StepInputs(1 / model.fps, blended=blended)
     u = jnp.einsum("vij,vjk->vik", blended[:, :, :3], found.directions)
 
     def along(q):
@@ -78,7 +80,11 @@ def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
 def test_a_swing_is_implicit_euler_along_the_vibrations(tmp_path):
     """Every frame minimises inertia about its own two frames before, and the energy of the vibrations."""
     assembly, params, motion = ready(tmp_path, method="swing")
-    model, network, track = assembly.model, replace(assembly.network, damping=0.0), track_of(assembly.model, motion)
+    model, network, track = (
+        assembly.model,
+        replace(assembly.network, damping=0.0),
+        features_from_records(assembly.model, motion),
+    )
     q = np.asarray(network.swings(params, model, track))
     static = np.asarray(animate(model, network, params, track, None))
     mass = np.asarray(model.material.density * model.garment.mesh.vertex_area)
@@ -96,7 +102,7 @@ def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped(tmp_pat
     assembly, params, motion = ready(tmp_path, method="swing")
     still = 300
     poses, places = (np.concatenate([a, np.repeat(a[-1:], still, axis=0)]) for a in (motion.poses, motion.translation))
-    track, model = track_of(assembly.model, edited(motion, poses, places)), assembly.model
+    track, model = features_from_records(assembly.model, edited(motion, poses, places)), assembly.model
     left = []
     for damping in (0.0, 2.0):
         q = np.asarray(replace(assembly.network, damping=damping).swings(params, model, track))[-still:, 0]
@@ -111,16 +117,19 @@ def test_no_motion_no_swing_and_motions_end_to_end_know_nothing_of_each_other(tm
     assembly, params, motion = ready(tmp_path, method="swing")
     model, network = assembly.model, assembly.network
     still = edited(motion, np.repeat(motion.poses[3:4], 40, axis=0), np.repeat(motion.translation[3:4], 40, axis=0))
-    codes = network.codes(params, model, track_of(model, still))
+    codes = network.codes(params, model, features_from_records(model, still))
     assert np.abs(codes.swing).max() < 1e-12 and np.abs(codes.dynamic).max() < 1e-12
-    once = network.swings(params, model, track_of(model, motion))
-    every = network.swings(params, model, track_of(model, motion, still, motion))
+    once = network.swings(params, model, features_from_records(model, motion))
+    every = network.swings(params, model, features_from_records(model, motion, still, motion))
     np.testing.assert_allclose(every, jnp.concatenate([once, jnp.zeros((40, 3)), once]), rtol=0, atol=1e-12)
 
 
 def test_alpha_scales_the_swing_and_the_code_that_goes_with_it(tmp_path):
     assembly, params, motion = ready(tmp_path, method="swing")
-    network, codes = assembly.network, assembly.network.codes(params, assembly.model, track_of(assembly.model, motion))
+    network, codes = (
+        assembly.network,
+        assembly.network.codes(params, assembly.model, features_from_records(assembly.model, motion)),
+    )
     np.testing.assert_allclose(network._dynamic(params, 3.0 * codes.swing), 3.0 * codes.dynamic, rtol=1e-12, atol=1e-15)
     np.testing.assert_array_equal(codes.swung(3.0), 3.0 * codes.swing)
     moved = [np.abs(run(assembly, params, motion, alpha) - run(assembly, params, motion, 0.0)).max() for alpha in (1.0, 2.0)]
@@ -173,7 +182,7 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
             blended = blend(m, model.blend)
             x = skin(blended, rest + y[..., i] + d @ (share[i] * track.swing[others[i]]))
             body = None if model.body is None else pose_body(model, m)
-            frame = Frame(1 / model.fps, body=body, blended=blended)
+            frame = StepInputs(1 / model.fps, body=body, blended=blended)
             value += total(x, model.garment, model.material, frame, terms, model.surface)
             c = jnp.einsum("vik,v,vi->k", d, mass, y[..., i] - still[..., i])
             q, r = share[i] * track.swing[others[i]], c / moved

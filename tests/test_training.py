@@ -8,25 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.assembly import assemble
-from ncs_jax.energies.collision import vertex_normals
-from ncs_jax.kinematics import blend, skin
-from ncs_jax.model import pose_body
-from ncs_jax.objective import Frame, energies
-from ncs_jax.scene import load_scene, scene_from
-from ncs_jax.training import (
-    CHUNK,
-    batches,
-    chunk_runner,
-    chunks,
-    diagnose,
-    glance,
-    gradients,
-    initial_state,
-    physics,
-    step_size,
-    with_bodies,
-)
+from ncs_jax.energies.contact.surface import vertex_normals
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import energies
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import pose_body
+from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.training.batches import CHUNK, batches, chunks
+from ncs_jax.training.loss import gradients, physics, with_bodies
+from ncs_jax.training.metrics import diagnose, training_metrics
+from ncs_jax.training.step import chunk_runner, initial_state, step_size
 
 from .scenes import write_scene
 
@@ -68,7 +60,7 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
     for i in range(len(poses)):
         x, previous, before = (skin(blend(at[0][k, ..., i], exact.blend), at[1][k][..., i]) for k in range(3))
         terms = dataclasses.replace(model.terms, collision=None)
-        expected = energies(x, exact.garment, exact.material, Frame(1 / model.fps, previous, before), terms)
+        expected = energies(x, exact.garment, exact.material, StepInputs(1 / model.fps, previous, before), terms)
         body = pose_body(exact, at[0][0, ..., i])
         normals = np.asarray(vertex_normals(body, exact.surface))
         apart = np.asarray(x)[:, None] - np.asarray(body)[None]
@@ -84,10 +76,11 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
 @pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])
 def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
     """Against automatic differentiation of the whole chain: x_{t-1} and x_{t-2} are constants to NCS, and not to SNUG."""
-    from ncs_jax.kinematics import blend, skin
-    from ncs_jax.methods.shared import decode
-    from ncs_jax.model import pose_body
-    from ncs_jax.objective import Frame, total
+    from ncs_jax.energies.terms import StepInputs
+    from ncs_jax.energies.total import total
+    from ncs_jax.geometry.skinning import blend, skin
+    from ncs_jax.network.methods.method import decode
+    from ncs_jax.scene.model import pose_body
 
     assembly, spec, ends, pairs = prepared(tmp_path, {"network.method": method}, dtype=jnp.float64)
     model, network, track = assembly.model, assembly.network, assembly.track
@@ -109,7 +102,7 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
                 skin(blend(track.matrices[f], model.blend), model.garment.mesh.rest + offsets[:, :, k, i])
                 for k, f in enumerate(at)
             ]
-            frame = Frame(1 / model.fps, hold(x[1]), hold(x[0]))
+            frame = StepInputs(1 / model.fps, hold(x[1]), hold(x[0]))
             frame = dataclasses.replace(frame, body=pose_body(model, track.matrices[t]))
             result += total(x[2], model.garment, model.material, frame, terms, model.surface)
         return result / len(ends)
@@ -168,7 +161,7 @@ def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path, monkeypa
     assert track.bodies.shape == (len(track.start), len(assembly.model.body), 6)
     expected, energies, _ = one_gradient(assembly, spec, params, ends[0], pairs[0])
     found, parts, _ = one_gradient(dataclasses.replace(assembly, track=track), spec, params, ends[0], pairs[0])
-    monkeypatch.setattr("ncs_jax.training.BODIES", track.bodies.nbytes - 1)
+    monkeypatch.setattr("ncs_jax.training.loss.BODIES", track.bodies.nbytes - 1)
     assert with_bodies(assembly.model, assembly.track, 3) is assembly.track
     for name, energy in energies.items():
         np.testing.assert_allclose(parts[name], energy, rtol=1e-5, err_msg=name)
@@ -187,7 +180,7 @@ def test_energy_falls(tmp_path, plain_jax):
         energy.append(float(sum(np.mean(v) for k, v in logs.items() if k != "gravity")))
     assert energy[-1] < 0.6 * energy[0]
     assert int(state.dropped) == 0 and int(state.step) == 60
-    seen = glance(assembly.model, assembly.network, spec.window, state.params, assembly.track, ends[-1])
+    seen = training_metrics(assembly.model, assembly.network, spec.window, state.params, assembly.track, ends[-1])
     assert 0 <= float(seen["strain"]) < 20 and 0 <= float(seen["penetrating"]) <= 100
 
 
@@ -227,7 +220,7 @@ def test_cloth_that_comes_too_near_itself_is_pushed_apart(tmp_path, plain_jax):
         terms = dataclasses.replace(
             model.terms, membrane=None, bending=False, collision=None, gravity=False, inertia=False, pinning=False
         )
-        return energies(x, model.garment, model.material, Frame(), terms)["self_contact"]
+        return energies(x, model.garment, model.material, StepInputs(), terms)["self_contact"]
 
     offsets = jnp.asarray(fold, jnp.float32)
     before, slope = jax.jit(jax.value_and_grad(value))(offsets)
@@ -251,7 +244,7 @@ def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, pla
 
 
 def test_learned_skinning_weights_get_a_gradient_and_stay_weights(tmp_path, plain_jax):
-    from ncs_jax.methods.shared import garment_blend
+    from ncs_jax.network.methods.method import garment_blend
 
     assembly, spec, ends, pairs = prepared(tmp_path, {"garment.learn_weights": True})
     run = chunk_runner(assembly.network, spec)

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from ncs_jax.errors import InputError
-from ncs_jax.viewer import write_page
+from ncs_jax.view.page import write_page
 
 FRAMES = 24
 

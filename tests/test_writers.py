@@ -12,9 +12,9 @@ import pytest
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.io import usd
-from ncs_jax.io.glb import write_glb
-from ncs_jax.io.normals import vertex_normals
+from ncs_jax.io.animation.glb import write_glb
+from ncs_jax.io.mesh import usd
+from ncs_jax.io.mesh.normals import vertex_normals
 
 from . import characters
 from .shapes import tube

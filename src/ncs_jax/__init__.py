@@ -1,14 +1,19 @@
 """Neural cloth simulation in JAX: a garment learns to move on an animated character from the physics energy alone."""
 
-from ncs_jax.assembly import Assembly, assemble
+from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import energies, total
 from ncs_jax.errors import InputError
-from ncs_jax.evaluation import measure, summarise
-from ncs_jax.model import Model, local_rotations
-from ncs_jax.objective import Frame, Garment, Material, Terms, energies, total
-from ncs_jax.rollout import animate, stepper
-from ncs_jax.runs import Report, Run, load_run, train
-from ncs_jax.scene import Scene, load_scene, scene_from
-from ncs_jax.simulation import Trajectory, simulate
+from ncs_jax.metrics.quality import measure, summarise
+from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.runs.log import Report
+from ncs_jax.runs.run import Run, assemble, load_run
+from ncs_jax.runs.simulate import Trajectory, simulate
+from ncs_jax.runs.train import train
+from ncs_jax.scene.model import Model, local_rotations
+from ncs_jax.scene.spec import Scene, load_scene, scene_from
+
+Frame = StepInputs  # its name until version 0.1
 
 __all__ = [
     "Assembly",
@@ -20,6 +25,7 @@ __all__ = [
     "Report",
     "Run",
     "Scene",
+    "StepInputs",
     "Terms",
     "Trajectory",
     "animate",

@@ -8,8 +8,9 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.mesh import Mesh, mesh_from
-from ncs_jax.objective import Frame, Garment, Material, Terms, total
+from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import total
+from ncs_jax.geometry.mesh import Mesh, mesh_from
 
 from .newton import minimiser
 
@@ -69,4 +70,4 @@ def _settler(terms: Terms, places: tuple[int, ...]):
 def settle(terms: Terms, free, x, cloth: Garment, numbers: Material, frame=None, surface=None) -> np.ndarray:
     """Where the total energy is least, near x; `free` (verts, 3) or (verts, 1) bool says what may move."""
     places = tuple(np.flatnonzero(np.broadcast_to(free, np.shape(x))).tolist())
-    return np.asarray(_settler(terms, places)(x, cloth, numbers, frame or Frame(), surface))
+    return np.asarray(_settler(terms, places)(x, cloth, numbers, frame or StepInputs(), surface))

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax.objective import Frame, total
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import total
 
 from ..shapes import rotation, sheet
 from .cloth import DENSITY, GRAVITY, NOTHING, chain, garment, material, settle
@@ -24,7 +25,7 @@ def simulate(cloth, numbers, terms, start, velocity, dt, steps, free=True):
     """Positions (steps + 2, verts, 3): two frames of the start, then what the minimiser makes of them."""
     frames = [start - dt * velocity, start]
     for _ in range(steps):
-        frame = Frame(jnp.asarray(dt), *(jnp.asarray(x) for x in (frames[-1], frames[-2])))
+        frame = StepInputs(jnp.asarray(dt), *(jnp.asarray(x) for x in (frames[-1], frames[-2])))
         frames.append(settle(terms, free, 2 * frames[-1] - frames[-2], cloth, numbers, frame))
     return np.stack(frames)
 
@@ -177,7 +178,7 @@ def test_inner_forces_have_no_sum_and_no_torque(membrane, rng):
     numbers = {"baraff_witkin": (40.0, 20.0), "mass_spring": (60.0,), None: ()}.get(membrane, (41.8, 22.2))
     terms = dataclasses.replace(NOTHING, membrane=membrane, bending=membrane is None)
     x = vertices + 3e-3 * rng.normal(size=vertices.shape) + [0.5, 1.0, -0.3]
-    force = -jax.jit(jax.grad(lambda x: total(x, cloth, material(numbers, 1e-5), Frame(), terms)))(jnp.asarray(x))
+    force = -jax.jit(jax.grad(lambda x: total(x, cloth, material(numbers, 1e-5), StepInputs(), terms)))(jnp.asarray(x))
     size = np.abs(force).sum()
     assert size > 1e-6
     np.testing.assert_allclose(np.sum(force, axis=0), 0, atol=1e-12 * size)

@@ -12,10 +12,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from ncs_jax.model import local_rotations
-from ncs_jax.objective import Frame, total
-from ncs_jax.simulator import simulator_from, stepper
-from ncs_jax.solver.minimise import CONVERGED
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import total
+from ncs_jax.scene.model import local_rotations
+from ncs_jax.simulation.implicit_euler import simulator_from, stepper
+from ncs_jax.simulation.solver.minimise import CONVERGED
 
 from ..scenes import grid
 from ..shapes import rotation
@@ -78,7 +79,7 @@ def test_a_vibration_has_the_frequency_of_its_mode(weightless, mode):
     simulator, pose = weightless
     model, mass, dt = simulator.model, np.repeat(masses(simulator), 3, axis=1), 1 / simulator.model.fps
     rest, terms = model.garment.mesh.rest, replace(model.terms, inertia=False)
-    hessian = jax.jit(jax.hessian(lambda x: total(x, model.garment, model.material, Frame(), terms)))(rest)
+    hessian = jax.jit(jax.hessian(lambda x: total(x, model.garment, model.material, StepInputs(), terms)))(rest)
     scale = mass.reshape(-1) ** -0.5
     squares, modes = np.linalg.eigh(scale[:, None] * np.asarray(hessian).reshape(rest.size, -1) * scale)
     first = np.flatnonzero(squares > 30**2)[mode]  # below lie rigid motions and bending

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from ncs_jax.energies.collision import surface_from
-from ncs_jax.objective import Frame, Terms, total
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.terms import StepInputs, Terms
+from ncs_jax.energies.total import total
 
 from ..shapes import equilateral, sheet
 from .cloth import DENSITY, GRAVITY, NOTHING, chain, garment, material, settle
@@ -115,7 +116,7 @@ def test_a_patch_pulled_along_narrows_and_pulls_back_as_its_law_says(model, shap
     else:
         free[border] = False
     numbers = material((LAM, MU))
-    pull = jax.jit(jax.grad(lambda x: total(x, cloth, numbers, Frame(), terms)))
+    pull = jax.jit(jax.grad(lambda x: total(x, cloth, numbers, StepInputs(), terms)))
     for s in (0.85, 1.05, 1.2):
         force, t = tension(model, s)
         expected = vertices * [s, t, 1]
@@ -145,7 +146,7 @@ def rolled(columns, angle):
     column = np.tile(np.arange(columns), 3)
     bent = np.stack([x[column], vertices[:, 1], z[column]], axis=1)
     cloth = garment(vertices, faces)
-    return float(jax.jit(lambda x: total(x, cloth, material(bending=BEND), Frame(), BENDING))(jnp.asarray(bent))), 2 * h
+    return float(jax.jit(lambda x: total(x, cloth, material(bending=BEND), StepInputs(), BENDING))(jnp.asarray(bent))), 2 * h
 
 
 def test_a_cylinder_costs_the_square_of_its_curvature():
@@ -192,7 +193,7 @@ def test_a_cantilever_sags_under_its_weight():
         across = jnp.asarray(vertices * [0, 1, 0])
 
         def energy(columns, cloth=cloth, column=column, across=across):
-            return total(columns[column] + across, cloth, numbers, Frame(), terms)
+            return total(columns[column] + across, cloth, numbers, StepInputs(), terms)
 
         start = vertices[: cells + 2] * [1, 0, 1]
         free = np.tile((start[:, 0] > h)[:, None], (1, 3)) & [True, False, True]
@@ -215,7 +216,7 @@ def laid_down(distance, gravity, membrane=(0.0, 0.0), bending=0.0):
     start = np.asarray(cloth.mesh.rest) + [0, 0, 0.9 * THICKNESS]
     surface, terms = surface_from(start, body, triangles), Terms(collision=distance, inertia=False)
     numbers = material(membrane, bending, gravity, STIFFNESS, THICKNESS)
-    found = settle(terms, UP, start, cloth, numbers, Frame(body=jnp.asarray(body)), surface)
+    found = settle(terms, UP, start, cloth, numbers, StepInputs(body=jnp.asarray(body)), surface)
     return THICKNESS - found[:, 2], np.asarray(DENSITY * cloth.mesh.vertex_area)
 
 

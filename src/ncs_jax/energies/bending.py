@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ncs_jax.mesh import Mesh, corners, dihedral, spread
-from ncs_jax.numerics import arctan2, least_length
-from ncs_jax.vectors import Vector, cross, dot, length, minus, times
+from ncs_jax.geometry.mesh import Mesh, corners, dihedral, spread
+from ncs_jax.geometry.numerics import arctan2, least_length
+from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, times
 
 __all__ = ["angles", "bending", "fold_gradient", "per_hinge"]
 

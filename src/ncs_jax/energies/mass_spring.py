@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ncs_jax.mesh import Mesh, corners, spread
-from ncs_jax.vectors import Vector, length, minus
+from ncs_jax.geometry.mesh import Mesh, corners, spread
+from ncs_jax.geometry.soa_vectors import Vector, length, minus
 
 __all__ = ["mass_spring", "per_edge"]
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 from jaxtyping import Array, Float
 
-from ncs_jax.mesh import Mesh, corners, spread
-from ncs_jax.vectors import Vector, minus, plus, times
+from ncs_jax.geometry.mesh import Mesh, corners, spread
+from ncs_jax.geometry.soa_vectors import Vector, minus, plus, times
 
 __all__ = ["columns", "deformation", "per_face"]
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.membrane import Columns, per_face
-from ncs_jax.mesh import Mesh, corners
-from ncs_jax.vectors import dot
+from ncs_jax.geometry.mesh import Mesh, corners
+from ncs_jax.geometry.soa_vectors import dot
 
 __all__ = ["density", "stvk"]
 

@@ -1,9 +1,9 @@
 """Files in and out: readers return checked NumPy records, and whatever is wrong with a file becomes one InputError."""
 
-from ncs_jax.io.animation import read_animation, write_animation
-from ncs_jax.io.body import read_body
-from ncs_jax.io.garment import read_garment, write_garment
-from ncs_jax.io.motion import read_motion
+from ncs_jax.io.animation.animation import read_animation, write_animation
+from ncs_jax.io.character.body import read_body
+from ncs_jax.io.character.motion import read_motion
+from ncs_jax.io.mesh.garment import read_garment, write_garment
 from ncs_jax.io.records import AnimationRecord, BodyRecord, GarmentRecord, MotionRecord
 
 __all__ = [

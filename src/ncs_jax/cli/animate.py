@@ -1,0 +1,76 @@
+"""`ncs animate` and `ncs export`: a trained garment over a motion, and its step as a file."""
+
+from __future__ import annotations
+
+from ncs_jax.cli import arguments
+from ncs_jax.errors import InputError
+
+__all__ = ["add_commands", "animate", "export"]
+
+
+def add_commands(commands) -> None:
+    """Declare the options."""
+    parser = arguments.command(commands, "animate", animate, "animate a trained garment over a motion")
+    parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
+    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    parser.add_argument(
+        "--alpha",
+        type=arguments.finite,
+        default=1.0,
+        help="how much the garment moves: 0 static, 1 as trained, more exaggerates",
+    )
+    parser.add_argument(
+        "--rank", type=arguments.whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
+    )
+    parser.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
+    parser.add_argument("--out", required=True, metavar="FILE", help=arguments.FORMATS)
+    parser.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
+
+    parser = arguments.command(
+        commands, "export", export, "write one step of a trained garment for a host that has neither JAX nor this package"
+    )
+    parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
+    parser.add_argument("--format", choices=("onnx", "stablehlo"), default="onnx", help="default: onnx")
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file; what a host has to know goes to FILE.json")
+    parser.add_argument("--motion", metavar="FILE", help="to check it on and to fit --rank to (default: one of the scene's)")
+    parser.add_argument("--rank", type=arguments.whole, default=0, help="a smaller decoder: its rank, say 64; prints the error")
+    parser.add_argument("--float16", action="store_true", help="store weights in 16 bits (computed in 32); prints the error")
+    parser.add_argument("--opset", type=arguments.whole, default=15, help="of the ONNX operators, 13 to 21 (default: 15)")
+
+
+def animate(options) -> int:
+    """Animate a trained garment over a motion, and write it to a file."""
+    import numpy as np
+
+    from ncs_jax import io
+    from ncs_jax.runs.run import load_run
+
+    run = load_run(options.folder)
+    motions = (options.motion,) if options.motion else run.assembly.scene.motions
+    if not motions:
+        raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+    worn_by = None
+    if options.body:
+        if run.assembly.body is None:
+            raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
+        worn_by = run.assembly.body, run.motion(motions[0])
+    vertices, error = run.animate(motions[0], options.alpha), ""
+    if options.rank or options.bfloat16:
+        smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
+        whole, vertices = vertices, smaller.animate(motions[0], options.alpha)
+        apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
+        error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
+    garment = run.assembly.garment
+    fps = run.assembly.model.fps
+    io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, worn_by=worn_by)
+    print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
+    return 0
+
+
+def export(options) -> int:
+    """Write one step of a trained garment as a file, and print how it was checked."""
+    from ncs_jax.runs.run import load_run
+
+    chosen = {name: getattr(options, name) for name in ("format", "rank", "float16", "opset", "motion")}
+    print(load_run(options.folder).export(options.out, **chosen))
+    return 0

@@ -1,0 +1,63 @@
+"""What the options of all commands have in common: how one is declared, and the types of their values."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable
+
+__all__ = ["FORMATS", "command", "finite", "hosts", "positive", "seed", "whole"]
+
+FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
+
+
+def command(commands, name: str, run: Callable, text: str) -> argparse.ArgumentParser:
+    """Add a command that calls `run` with its options, and return its parser."""
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def positive(text: str) -> float:
+    """Return a number above 0."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"a number above 0 expected, found {text}")
+    return value
+
+
+def whole(text: str) -> int:
+    """Return a whole number from 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"a whole number from 1 expected, found {text}")
+    return value
+
+
+def seed(text: str) -> int:
+    """Return a seed, 0 to 2^31 - 1."""
+    value = int(text)
+    if not 0 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {2**31 - 1} expected, found {text}")
+    return value
+
+
+def finite(text: str) -> float:
+    """Return a finite number."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"a finite number expected, found {text}")
+    return value
+
+
+def hosts(text: str) -> dict:
+    """Arguments of `jax.distributed.initialize`."""
+    if text == "auto":
+        return {}
+    found = re.fullmatch(r"(.+):(\d+),(\d+),(\d+)", text)
+    if not found or not 0 < int(found[2]) < 65536 or int(found[4]) >= int(found[3]):
+        raise argparse.ArgumentTypeError(f"HOST:PORT,COUNT,RANK with RANK below COUNT, or auto, expected, found {text}")
+    every = {"cluster_detection_method": "deactivate"}  # all devices of this host, whoever started the command
+    address = f"{found[1]}:{found[2]}"
+    return {"coordinator_address": address, "num_processes": int(found[3]), "process_id": int(found[4]), **every}

@@ -1,0 +1,88 @@
+"""`ncs evaluate`: measure an animation in physical units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.cli import arguments
+from ncs_jax.errors import InputError
+from ncs_jax.scene.spec import load_scene
+
+__all__ = ["add_commands", "evaluate"]
+
+
+def add_commands(commands) -> None:
+    """Declare the options."""
+    parser = arguments.command(
+        commands, "evaluate", evaluate, "measure strain, shear, penetration, energies and forces out of balance"
+    )
+    parser.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
+    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's)")
+    parser.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
+    parser.add_argument("--alpha", type=arguments.finite, default=1.0, help="motion control")
+    parser.add_argument(
+        "--reference", metavar="FILE", help="an animation of the same motion, say by ncs simulate, to compare the movement with"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON, with every frame")
+
+
+def evaluate(options) -> int:
+    """`ncs evaluate`: how an animation does and how it moves, in physical units."""
+    from ncs_jax.metrics.motion import MEASURES, compare_motion, measure_motion
+    from ncs_jax.metrics.quality import QUANTITIES, measure, summarise
+    from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
+
+    target = Path(options.target)
+    if not target.exists():
+        raise InputError("no such run folder or animation", file=target, mend="check the path")
+    rows, moving = {}, {}
+
+    def look(run, name, track, vertices):
+        model = run.assembly.model
+        rows[name], moving[name] = measure(model, vertices, track), measure_motion(model, vertices, track)
+        if options.reference is None:
+            return
+        reference = read_animation_over(options.reference, model, track)
+        moving[name] |= compare_motion(model, vertices, reference, track)
+
+    if target.is_dir() and not options.scene:
+        run = load_run(target)
+        names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
+        if options.reference is not None and len(names) > 1:
+            raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")
+        for name in names:
+            track = run.track(name)
+            look(run, name, track, run.animate(track, options.alpha))
+            if options.alpha != 0 and run.assembly.network.controlled:
+                still = measure_motion(run.assembly.model, run.animate(track, 0.0), track)["speed"]
+                moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
+    else:
+        if not options.scene:
+            raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
+        scene = load_scene(options.scene)
+        names = (options.motion,) if options.motion else scene.motions
+        if not names:
+            raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
+        run = Run(assemble(scene.without_network()), {})
+        track = run.track(names[0])
+        look(run, names[0], track, read_animation_over(target, run.assembly.model, track))
+    if options.json:
+        frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}
+        print(json.dumps({n: {"mean": summarise(r) | moving[n], "frames": frames[n]} for n, r in rows.items()}))
+        return 0
+    means = {name: summarise(r) | moving[name] for name, r in rows.items()}
+    if len(means) > 1:
+        every = dict.fromkeys(k for m in means.values() for k in m)
+        means["all"] = summarise({k: np.array([m[k] for m in means.values() if k in m]) for k in every})
+    labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
+    width = max(map(len, labels)) + 2
+    for quantity in dict.fromkeys(k for m in means.values() for k in m):
+        unit, text = (QUANTITIES | MEASURES).get(quantity, ("J", "energy"))
+        print(f"{quantity} [{unit}], {text}" if unit else f"{quantity}, {text}")
+        for name, m in zip(labels, means.values(), strict=True):
+            if quantity in m:
+                print(f"  {name:{width}} {m[quantity]:.4g}")
+    return 0

@@ -1,0 +1,62 @@
+"""`ncs simulate`: animate a scene's garment without a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ncs_jax.cli import arguments
+from ncs_jax.cli.clock import clock
+
+__all__ = ["add_commands", "simulate"]
+
+
+def add_commands(commands) -> None:
+    """Declare the options."""
+    parser = arguments.command(
+        commands, "simulate", simulate, "animate the garment of a scene by full-space simulation, without a network"
+    )
+    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
+    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    parser.add_argument(
+        "--out", required=True, metavar="FILE",
+        help=f"{arguments.FORMATS}; an interrupted simulation goes on from FILE.partial.npz",
+    )  # fmt: skip
+
+
+def simulate(options) -> int:
+    """Simulate a scene's garment with a bar, write it to a file, and print how the solves went."""
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from ncs_jax import io
+    from ncs_jax.runs import simulate as runs_simulate
+
+    partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
+    console = Console()
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("reading the scene and compiling", total=None)
+
+        def show(p):
+            text = f"frame {p.frame}/{p.frames}  {p.iterations} iterations  {p.residual:.3g} g  {clock(p.left)} left"
+            progress.update(task, total=p.frames, completed=p.frame, description=text)
+            if not console.is_terminal and (p.frame % 30 == 0 or p.frame == p.frames):
+                print(text, flush=True)
+
+        result = runs_simulate.simulate(options.scene, options.motion, partial=partial, report=show)
+    garment = result.assembly.garment
+    io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices)
+    partial.unlink(missing_ok=True)
+    print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
+    precision = "double" if result.vertices.dtype == np.float64 else "single"
+    print(
+        f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g, "
+        f"median {np.median(result.seconds):.3g} s, {precision} precision"
+    )
+    for status, text in ((1, "out of iterations"), (2, "no step lowers the energy further"), (3, "not finite")):
+        frames = np.flatnonzero(result.status == status)
+        if frames.size:
+            worst = result.residual[frames].max()
+            print(f"  {frames.size} frames not at tolerance: {text} (first: frame {frames[0]}, worst {worst:.3g} g)")
+    return 0

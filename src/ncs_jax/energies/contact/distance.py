@@ -1,0 +1,115 @@
+"""Signed distance to a body feature that is known: a vertex's tangent plane, or a triangle."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.energies.contact.surface import Surface, face_normals
+from ncs_jax.geometry.numerics import angle_between, normalize
+from ncs_jax.geometry.soa_vectors import dot, minus
+
+__all__ = ["closest_weights", "gap_to", "plane_distance", "triangle_distance"]
+
+
+def plane_distance(
+    x: Float[Array, "verts 3 *poses"],
+    body: Float[Array, "body 3 *poses"],
+    normals: Float[Array, "body 3 *poses"],
+    index: Int[Array, "verts *poses"],
+) -> Float[Array, "verts *poses"]:
+    """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
+    poses = index[:1].size
+    at = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
+
+    def near(table):  # each component by itself, which on a CPU is gathered several times faster than rows of three
+        flat = [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
+        return [component.reshape(index.shape) for component in flat]
+
+    return dot(near(normals), minus([x[:, i] for i in range(3)], near(body)))
+
+
+def triangle_distance(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, index: Int[Array, "verts"]
+) -> Float[Array, "verts"]:
+    """Exact signed distance in m to the nearest triangle `index`, negative inside.
+
+        d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
+
+    The sign comes from the pseudo-normal of the feature that holds c (face, edge or vertex), which alone is right at
+    edges and vertices; on the rim of a touchable part, where the body goes on unseen, everything counts as outside. The
+    closest point and n are constants to the derivative, which is exact to first order; on the surface itself, and wherever c
+    lies within a face, n is the pseudo-normal. Differences are formed from a corner of the triangle, so that it costs no
+    accuracy to be far from the origin. Source: Baerentzen and Aanaes 2005; closest point after Ericson 2005, 5.1.5.
+    """
+    triangle = body[surface.faces[index]]
+    weights = closest_weights(lax.stop_gradient(x), lax.stop_gradient(triangle))
+    normal = _pseudo_normal(lax.stop_gradient(body), surface, index, weights)
+    gap = gap_to(x, triangle, weights)
+    away = lax.stop_gradient(gap)
+    length = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
+    side = jnp.sign(jnp.sum(away * normal, axis=-1, keepdims=True))
+    rim = jnp.all(surface.border[surface.faces[index]] | (weights <= 0), axis=-1, keepdims=True)
+    side = jnp.where(rim, 1, side)
+    touching = length < 1e-7  # m: the rounding of a float32 position at 1 m
+    within = jnp.all(weights > 0, axis=-1, keepdims=True) & ~rim
+    direction = jnp.where(touching | within | (side == 0), normal, side * away / jnp.where(touching, 1, length))
+    return jnp.sum(direction * gap, axis=-1)
+
+
+def gap_to(x, corners, weights):
+    """x - sum_k w_k c_k (..., 3) for weights that add up to 1, as differences from the first corner."""
+    a, b, c = (corners[..., k, :] for k in range(3))
+    return x - a - weights[..., 1:2] * (b - a) - weights[..., 2:] * (c - a)
+
+
+def closest_weights(x, corners):
+    """Barycentric coordinates (verts, 3) of the closest point of each triangle."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, ac, bc = b - a, c - a, c - b
+    normal = jnp.cross(ab, ac)
+    square = jnp.sum(normal * normal, axis=-1)
+
+    def dot(p, q):
+        return jnp.sum(p * q, axis=-1)
+
+    def ratio(p, q):
+        return jnp.clip(p / jnp.where(q > 0, q, 1), 0, 1)
+
+    wa = dot(jnp.cross(bc, x - b), normal)
+    wb = dot(jnp.cross(-ac, x - c), normal)
+    wc = dot(jnp.cross(ab, x - a), normal)
+    face = jnp.stack([wa, wb, wc], axis=-1) / jnp.where(square > 0, square, 1)[:, None]
+    inside = (square > 0) & jnp.all(face > 0, axis=-1)
+    s, t, u = (
+        ratio(dot(x - a, ab), dot(ab, ab)),
+        ratio(dot(x - b, bc), dot(bc, bc)),
+        ratio(dot(x - c, -ac), dot(ac, ac)),
+    )
+    zero = jnp.zeros_like(s)
+    edges = jnp.stack([jnp.stack(w, axis=-1) for w in ([1 - s, s, zero], [zero, 1 - t, t], [u, zero, 1 - u])], axis=1)
+    gap = gap_to(x[:, None], corners[:, None], edges)
+    best = jnp.argmin(jnp.sum(gap * gap, axis=-1), axis=1)
+    return jnp.where(inside[:, None], face, jnp.take_along_axis(edges, best[:, None, None], axis=1)[:, 0])
+
+
+def _pseudo_normal(body, surface, index, weights):
+    """Normal of the feature that holds the closest point: face, mean of an edge's two faces, or angle-weighted at a vertex."""
+    normals = jnp.concatenate([face_normals(body, surface.faces), jnp.zeros_like(body[:1])])
+    zero = weights <= 0
+    count = jnp.sum(zero, axis=-1)
+    # the edge opposite corner k lies between corners k+1 and k+2, which is edge k+1 of the face
+    opposite = (jnp.argmax(zero, axis=-1) + 1) % 3
+    edge = jnp.take_along_axis(surface.face_edges[index], opposite[:, None], axis=1)[:, 0]
+    along = jnp.sum(normals[surface.edge_sides[edge]], axis=1)
+    corner = jnp.take_along_axis(surface.faces[index], jnp.argmax(weights, axis=-1)[:, None], axis=1)[:, 0]
+    ring = surface.rings[corner]  # (verts, most)
+    at = jnp.concatenate([surface.faces, jnp.zeros_like(surface.faces[:1])])[ring]
+    here = at == corner[:, None, None]
+    p = body[at]
+    first, second = jnp.roll(p, -1, axis=2), jnp.roll(p, -2, axis=2)
+    angles = jnp.sum(jnp.where(here, angle_between(first - p, second - p), 0), axis=-1)
+    tip = jnp.sum(angles[..., None] * normals[ring], axis=1)
+    chosen = jnp.where((count == 0)[:, None], normals[index], jnp.where((count == 1)[:, None], along, tip))
+    return normalize(chosen)

@@ -1,0 +1,145 @@
+"""The touchable part of the body, and compact groups of what lies near each other, for the searches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ncs_jax.geometry.mesh import corners, topology, vertex_rings
+from ncs_jax.geometry.numerics import normalize
+from ncs_jax.geometry.soa_vectors import cross, direction, minus
+
+__all__ = ["Surface", "compact_groups", "face_normals", "rebuild_lists", "surface_from", "vertex_normals"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Surface:
+    """What collision needs to know once about the part of the body that a garment can touch.
+
+    `cloth_blocks`, `vertex_blocks` and `face_blocks` are compact groups of cloth vertices, body vertices and body faces,
+    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. `vertex_lists` and
+    `face_lists` name the body groups that each cloth group searches first.
+    """
+
+    faces: Int[Array, "faces 3"]
+    rings: Int[Array, "body most"]
+    face_edges: Int[Array, "faces 3"]
+    edge_sides: Int[Array, "edges 2"]
+    border: Bool[Array, "body"]  # on the rim where the touchable part was cut out of the body
+    cloth_blocks: Int[Array, "blocks size"]
+    cloth_place: Int[Array, "verts"]
+    vertex_blocks: Int[Array, "clusters vertices"]
+    vertex_lists: Int[Array, "near_clusters blocks"]
+    face_blocks: Int[Array, "groups triangles"]
+    face_lists: Int[Array, "near_groups blocks"]
+    spacing: Float[Array, ""]  # mean edge length of the resting body, m
+    groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
+
+
+def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
+    """Halve the points along their longest extent until no group is larger than `size`; (groups, largest) indices."""
+    groups = [np.arange(len(points))]
+    while max(len(g) for g in groups) > size:
+        halves = []
+        for g in groups:
+            axis = np.ptp(points[g], axis=0).argmax()
+            g = g[np.argsort(points[g, axis], kind="stable")]
+            halves += [g[: (len(g) + 1) // 2], g[(len(g) + 1) // 2 :]]
+        groups = [g for g in halves if len(g)]
+    largest = max(len(g) for g in groups)
+    return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
+
+
+def _boxed(points, blocks):
+    """Lowest and highest corners (3, groups) of the boxes around groups of points (count, 3) or of triangles' corners."""
+    grouped = np.asarray(points, np.float32)[blocks].reshape(len(blocks), -1, 3)
+    return grouped.min(axis=1).T, grouped.max(axis=1).T
+
+
+def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
+    """The `count` body groups that come nearest to each cloth group in any pose [(cloth, body)]: (count, cloth groups)."""
+    least = np.full((len(cloth_blocks), len(body_blocks)), np.inf, np.float32)
+    for cloth, body in posed:
+        (low, high), (below, above) = _boxed(cloth, cloth_blocks), _boxed(body, body_blocks)
+        apart = centres = np.zeros(())
+        for i in range(3):
+            gap = np.maximum(np.maximum(below[i] - high[i][:, None], low[i][:, None] - above[i]), 0)
+            middle = (low[i] + high[i])[:, None] / 2 - (below[i] + above[i]) / 2
+            apart, centres = apart + gap * gap, centres + middle * middle
+        np.minimum(least, np.sqrt(apart) + 1e-3 * np.sqrt(centres), out=least)
+    return np.argsort(least, axis=1, kind="stable")[:, :count].T.astype(np.int32)
+
+
+def rebuild_lists(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
+    """The same, its search for the nearest vertex prepared for what is near what in these poses [(cloth, body)]."""
+    lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
+    return replace(surface, vertex_lists=jax.device_put(lists))
+
+
+def surface_from(
+    cloth: np.ndarray,
+    body: np.ndarray,
+    faces: np.ndarray,
+    *,
+    smooth: bool = False,
+    posed: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> Surface:
+    """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body.
+
+    `posed`: the two in some poses of the motion, from which to tell what is usually near what; at rest where there is none.
+    `smooth`: for `nearby_quadrics`, which takes smaller groups of the body; otherwise for the searches, where the sizes are a
+    balance of what a group looks at, what it proves at once and what is left to be searched in full (a coarse garment: smaller
+    groups that look at more, since its far corners leave less proved).
+    """
+    fine = (16, 8, 32) if len(cloth) >= 2048 else (8, 8, 64)
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else fine
+    cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
+    cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
+    cloth_blocks = compact_groups(cloth, cloth_size)
+    vertex_blocks, face_blocks = compact_groups(body, body_size), compact_groups(body[faces].mean(axis=1), body_size)
+    place = np.zeros(len(cloth), np.int32)
+    place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
+    posed = posed or [(cloth, body)]
+    edges, sides, _ = topology(faces)
+    key = np.sort(edges, axis=1) @ [len(body), 1]
+    order = np.argsort(key)
+    wanted = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [len(body), 1]
+    face_edges = order[np.searchsorted(key[order], wanted)]
+    border = np.zeros(len(body), bool)
+    border[edges[sides[:, 1] < 0]] = True
+    return Surface(
+        faces=jax.device_put(faces.astype(np.int32)),
+        rings=jax.device_put(vertex_rings(faces, len(body))),
+        face_edges=jax.device_put(face_edges.astype(np.int32)),
+        edge_sides=jax.device_put(sides),
+        border=jax.device_put(border),
+        cloth_blocks=jax.device_put(cloth_blocks),
+        cloth_place=jax.device_put(place),
+        vertex_blocks=jax.device_put(vertex_blocks),
+        vertex_lists=jax.device_put(_lists(posed, cloth_blocks, vertex_blocks, groups)),
+        face_blocks=jax.device_put(face_blocks),
+        face_lists=jax.device_put(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
+        spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
+        groups=groups,
+    )
+
+
+def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> Float[Array, "faces 3"]:
+    """Unit normals; zero for a collapsed face."""
+    a, b, c = body[faces[:, 0]], body[faces[:, 1]], body[faces[:, 2]]
+    return normalize(jnp.cross(b - a, c - a))
+
+
+def vertex_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
+    """Area-weighted unit normals of the body's vertices."""
+    a, b, c = corners(body, surface.faces)
+    area = jnp.stack(cross(minus(b, a), minus(c, a)), axis=1)
+    around = [jnp.take(area, at, axis=0, mode="fill", fill_value=0) for at in surface.rings.T]
+    total = sum(around, start=jnp.zeros_like(body))
+    return jnp.stack(direction([total[:, i] for i in range(3)]), axis=1)

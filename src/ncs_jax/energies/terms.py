@@ -1,0 +1,92 @@
+"""What the energies take: which terms a scene has, its material, its garment, and what one step brings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.energies import baraff_witkin as _baraff_witkin
+from ncs_jax.energies import neo_hookean as _neo_hookean
+from ncs_jax.energies import stvk as _stvk
+from ncs_jax.energies.baraff_witkin import baraff_witkin
+from ncs_jax.energies.contact.pairs import Groups
+from ncs_jax.energies.mass_spring import mass_spring
+from ncs_jax.energies.neo_hookean import neo_hookean
+from ncs_jax.energies.stvk import stvk
+from ncs_jax.geometry.mesh import Mesh
+
+__all__ = ["DENSITIES", "MEMBRANES", "Garment", "Material", "StepInputs", "Terms"]
+
+
+MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
+    "stvk": (stvk, ("lam", "mu")),
+    "neo_hookean": (neo_hookean, ("lam", "mu")),
+    "baraff_witkin": (baraff_witkin, ("stretch", "shear")),
+    "mass_spring": (mass_spring, ("stiffness",)),
+}
+DENSITIES: dict[str, Callable[..., Array]] = {  # energy per rest area of the membranes that are made of faces
+    "stvk": _stvk.density,
+    "neo_hookean": _neo_hookean.density,
+    "baraff_witkin": _baraff_witkin.density,
+}
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Which terms a scene has. What is not named here is not traced."""
+
+    membrane: str | None = "stvk"
+    bending: bool = True
+    collision: str | None = "plane"  # "plane", "smooth", "triangle" or None
+    exact: bool = True  # exact search; otherwise candidates alone
+    friction: bool = False
+    gravity: bool = True
+    inertia: bool = True
+    through_time: bool = False  # inertia's target carries a gradient
+    pinning: bool = False
+    self_contact: bool = False
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Material:
+    """The numbers of the energies, in SI units; any of them may be differentiated or batched."""
+
+    density: Float[Array, ""]  # kg/m^2
+    membrane: tuple[Float[Array, ""], ...]  # in the order of MEMBRANES
+    bending: Float[Array, ""]  # N m
+    collision: Float[Array, ""]  # J/m^2 a vertex
+    thickness: Float[Array, ""]  # m
+    friction: Float[Array, ""]  # its coefficient
+    pinning: Float[Array, ""]  # N/m
+    gravity: Float[Array, 3]  # m/s^2
+    self_contact: Float[Array, ""] | None = None  # J/m^2 a pair
+    self_thickness: Float[Array, ""] | None = None  # m
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Garment:
+    """What a garment is to the energies: its mesh, which vertices are pinned, and its groups where there is self-contact."""
+
+    mesh: Mesh
+    pins: Int[Array, "pins"]
+    groups: Groups | None = None
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StepInputs:
+    """What one frame brings to the energies; `None` where no term asks for it."""
+
+    dt: float | Float[Array, ""] = field(default=1 / 30)  # s
+    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}
+    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}
+    body: Float[Array, "body 3 *poses"] | None = None  # posed
+    blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
+    carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
+    pressed: Float[Array, "verts 3"] | None = None  # `pressure` there, N
+    normals: Float[Array, "body 3 *poses"] | None = None  # of the body, where they are known already

@@ -1,0 +1,122 @@
+"""The total energy (10): the one place that knows every term."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.bending import bending
+from ncs_jax.energies.contact.collision import collision
+from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
+from ncs_jax.energies.contact.friction import friction
+from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
+from ncs_jax.energies.contact.pairs import nearby_pairs
+from ncs_jax.energies.contact.self_contact import self_contact
+from ncs_jax.energies.contact.smooth import blended_contact, nearby_quadrics
+from ncs_jax.energies.contact.surface import Surface, vertex_normals
+from ncs_jax.energies.gravity import gravity
+from ncs_jax.energies.inertia import inertia, project
+from ncs_jax.energies.pinning import pinning
+from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.geometry.skinning import unpose
+
+__all__ = ["contact_force", "distances", "energies", "total"]
+
+
+def distances(
+    x: Float[Array, "verts 3 *poses"],
+    body: Float[Array, "body 3 *poses"],
+    surface: Surface,
+    terms: Terms,
+    normals: Float[Array, "body 3 *poses"] | None = None,
+) -> Float[Array, "verts *poses"]:
+    """Signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone.
+
+    `normals`: of the body's vertices, where they are known; "plane" works them out otherwise.
+    """
+    if terms.collision == "triangle":
+        index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
+        return triangle_distance(x, body, surface, index)
+    if terms.collision == "smooth":
+        return blended_contact(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
+    index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
+    return plane_distance(x, body, vertex_normals(body, surface) if normals is None else normals, index)
+
+
+def _collision(x, body, surface, terms, material, normals=None):
+    if terms.collision == "smooth":
+        near = nearby_quadrics(x, body, surface)
+        return material.collision * jnp.sum(blended_contact(x, near, surface, material.thickness).shortfall)
+    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision)
+
+
+def contact_force(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms, material: Material
+) -> Float[Array, "verts 3"]:
+    """How the body's contact resists: its energy's derivative in N, towards the body."""
+    return jax.grad(_collision)(x, body, surface, terms, material)
+
+
+def _self_contact(x, garment, material):
+    pairs = nearby_pairs(x, garment.mesh, garment.groups, material.self_thickness)
+    value = self_contact(x, pairs, material.self_thickness, material.self_contact)
+    return jnp.where(pairs.overflow, jnp.nan, value)
+
+
+def energies(
+    x: Float[Array, "verts 3 *poses"],
+    garment: Garment,
+    material: Material,
+    frame: StepInputs,
+    terms: Terms,
+    surface: Surface | None = None,
+) -> dict[str, Float[Array, "*poses"]]:
+    """Every term of the total energy (10) by name, in J.
+
+    Args:
+        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity, inertia and the "plane" collision.
+        garment, material: what is constant. frame: what this frame brings.
+        terms: which terms exist. surface: the touchable body, where there is collision.
+
+    Self-contact is NaN where more pairs are near each other than its lists hold: an energy without some of them would be wrong.
+    The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler;
+    but for `through_time`.
+    """
+    mesh = garment.mesh
+    mass = material.density * mesh.vertex_area
+    parts = {}
+    if terms.membrane is not None:
+        with jax.named_scope("membrane"):
+            parts["membrane"] = MEMBRANES[terms.membrane][0](x, mesh, *material.membrane)
+    if terms.bending:
+        with jax.named_scope("bending"):
+            parts["bending"] = bending(x, mesh, material.bending)
+    if terms.collision is not None:
+        with jax.named_scope("collision"):
+            parts["collision"] = _collision(x, frame.body, surface, terms, material, frame.normals)
+    if terms.friction:
+        with jax.named_scope("friction"):
+            parts["friction"] = friction(x, frame.carried, frame.pressed, material.friction, frame.dt)
+    if terms.gravity:
+        with jax.named_scope("gravity"):
+            parts["gravity"] = gravity(x, mass, material.gravity)
+    if terms.inertia:
+        with jax.named_scope("inertia"):
+            target = project(frame.previous, frame.before)
+            target = target if terms.through_time else lax.stop_gradient(target)
+            parts["inertia"] = inertia(x, target, mass, frame.dt)
+    if terms.pinning:
+        with jax.named_scope("pinning"):
+            pins = garment.pins
+            parts["pinning"] = pinning(unpose(frame.blended[pins], x[pins]), mesh.rest[pins], material.pinning)
+    if terms.self_contact:
+        with jax.named_scope("self_contact"):
+            parts["self_contact"] = _self_contact(x, garment, material)
+    return parts
+
+
+def total(*arguments, **options) -> Float[Array, ""]:
+    """Total energy (10) in J: the sum of `energies`, called alike."""
+    return sum(energies(*arguments, **options).values(), start=jnp.zeros(()))

@@ -1,0 +1,272 @@
+"""What a triangle mesh fixes once: edges, hinges, areas, rest frames and lumped masses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.geometry.numerics import least_length
+from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, plus, times
+
+__all__ = ["LINE", "Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
+
+LINE = 2e-6  # a face's rest height, of its longest edge, up to which it is a line: its own positions in float32 tell no more
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Rings:
+    """What is around what in a whole mesh, so that elements read and forces add up without a scatter.
+
+    `faces` and `edges` tell where a vertex stands in them: `corner * elements + element`, padded with `corners * elements`.
+    `folds` are the hinges opposite the three corners of every face, padded with the number of hinges, and `turned` is -1 where
+    such a hinge sees the face from behind. `sides` are the two faces of a hinge, `behind` is -1 where it sees the second so.
+    """
+
+    faces: Int[Array, "verts most_faces"]
+    edges: Int[Array, "verts most_edges"]
+    folds: Int[Array, "faces 3"]
+    turned: Float[Array, "faces 3"]
+    sides: Int[Array, "hinges 2"]
+    behind: Float[Array, "hinges"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Mesh:
+    """A garment's rest state. Lengths in m, areas in m^2, angles in rad; elements of zero rest area weigh nothing.
+
+    A face up to `LINE` times as high as its longest edge is long is of zero rest area.
+
+    A hinge is an edge between two faces: its vertices are the two ends, then the one opposite in each face.
+    """
+
+    rest: Float[Array, "verts 3"]
+    faces: Int[Array, "faces 3"]
+    edges: Int[Array, "edges 2"]
+    hinges: Int[Array, "hinges 4"]
+    face_area: Float[Array, "faces"]
+    face_axes: Float[Array, "faces 2 2"]  # inverse of the rest edges (e1, e2) in the face's material axes (u, v), 1/m
+    vertex_area: Float[Array, "verts"]  # a third of the adjacent faces
+    edge_length: Float[Array, "edges"]
+    edge_weight: Float[Array, "edges"]  # 1 inside an equilateral mesh, 1/2 on its border
+    hinge_angle: Float[Array, "hinges"]
+    hinge_length: Float[Array, "hinges"]
+    hinge_area: Float[Array, "hinges 2"]
+    rings: Rings | None = None  # None in a part of a mesh
+
+
+def corners(x: Float[Array, "verts 3 *poses"], elements: Int[Array, "elements corners"]) -> list[Vector]:
+    """The places of the first corner of every element, of the second and so on: arrays (elements, *poses)."""
+    return [[p[:, i] for i in range(3)] for p in (x[elements[:, k]] for k in range(elements.shape[1]))]
+
+
+def spread(constant: Float[Array, "elements"], like: Float[Array, "elements *poses"]) -> Float[Array, "elements ..."]:
+    """An element's constant, to go with all the lanes."""
+    return constant.reshape(constant.shape + (1,) * (like.ndim - constant.ndim))
+
+
+def _normals(hinge: Sequence[Vector], areas: Sequence[Array]):
+    a, b, c, d = hinge
+    edge = minus(b, a)
+    return times(0.5 / areas[0], cross(edge, minus(c, a))), times(0.5 / areas[1], cross(minus(d, a), edge)), edge
+
+
+@jax.custom_jvp
+def dihedral(hinge: Sequence[Vector], areas: Sequence[Array]) -> Array:
+    """Signed angle phi in (-pi, pi] between the two faces of a hinge; 0 where flat, opposite for mirrored folds.
+
+        phi = atan2((n0 x n1) . e / |e|, n0 . n1),   dphi/dx_c = -|e| / (2 A0) n0 / |n0|^2,   likewise d,
+        dphi/dx_a = -(1 - t_c) dphi/dx_c - (1 - t_d) dphi/dx_d,   dphi/dx_b = -t_c dphi/dx_c - t_d dphi/dx_d,
+        t_c, t_d where the heights of the two faces stand on the edge, 0 at a and 1 at b
+
+    `hinge` holds the two ends a, b of the edge and the vertex opposite in each face, c, d, see `corners`; the normals n0, n1
+    are taken per rest area `areas` (m^2) so that products of them stay near 1 in float32, also in second derivatives. Exactly
+    folded or collapsed hinges have finite derivatives; a face of zero area gives angle 0.
+    """
+    n0, n1, edge = _normals(hinge, areas)
+    long = length(edge)
+    return jnp.arctan2(dot(cross(n0, n1), edge) / jnp.where(long > 0, long, 1), dot(n0, n1))
+
+
+@dihedral.defjvp
+def _dihedral_jvp(primals, tangents):
+    hinge, areas = primals
+    n0, n1, edge = _normals(hinge, areas)
+    long = length(edge)
+    unit = times(1 / jnp.where(long > 0, long, 1), edge)
+
+    def outward(normal, area):
+        size = dot(normal, normal)
+        solid = size > least_length(size.dtype)
+        return times(jnp.where(solid, -0.5 * long / (area * jnp.where(solid, size, 1)), 0), normal)
+
+    def along(corner):
+        return dot(minus(corner, hinge[0]), unit) / jnp.where(long > 0, long, 1)
+
+    c, d = outward(n0, areas[0]), outward(n1, areas[1])
+    s, t = along(hinge[2]), along(hinge[3])
+    a = plus(times(s - 1, c), times(t - 1, d))
+    b = plus(times(-s, c), times(-t, d))
+    change = sum(dot(slope, moved) for slope, moved in zip((a, b, c, d), tangents[0], strict=True))
+    return dihedral(hinge, areas), change
+
+
+def topology(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges (edges, 2), the faces on each side (edges, 2; -1 where there is none) and hinges (hinges, 4) of a manifold mesh."""
+    faces = np.asarray(faces)
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    owner = np.tile(np.arange(len(faces)), 3)
+    keys, first, inverse, counts = np.unique(
+        np.sort(half, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if counts.size and counts.max() > 2:
+        worst = keys[counts.argmax()]
+        raise ValueError(f"edge {worst.tolist()} has {counts.max()} faces; a manifold mesh has at most two")
+    inverse = inverse.reshape(-1)
+    second = np.full(len(keys), -1)
+    rest = np.ones(len(half), bool)
+    rest[first] = False
+    second[inverse[rest]] = np.flatnonzero(rest)
+    sides = np.stack([owner[first], np.where(second >= 0, owner[second], -1)], axis=1)
+    inner = second >= 0
+    hinges = np.concatenate([half[first[inner]], opposite[first[inner], None], opposite[second[inner], None]], axis=1)
+    return half[first].astype(np.int32), sides.astype(np.int32), hinges.astype(np.int32)
+
+
+def material_axes(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None, warp: tuple[float, float, float] = (0, 1, 0)
+) -> np.ndarray:
+    """Unit warp direction u of every face (faces, 3), in its plane.
+
+    From the UV map where there is one (the direction of growing v, the usual grain line), else the projection of `warp`;
+    where a face is nearly square to `warp`, that of the next axis is blended in, so neighbouring faces stay aligned.
+    """
+    p = np.asarray(vertices, np.float64)[faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    normal = np.cross(e1, e2)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+
+    def in_plane(d):
+        return d - normal * np.sum(normal * d, axis=1, keepdims=True)
+
+    first = np.asarray(warp, np.float64) / np.linalg.norm(warp)
+    squareness = np.sum(normal * first, axis=1, keepdims=True) ** 2
+    axis = in_plane(np.broadcast_to(first, normal.shape)) + squareness**8 * in_plane(
+        np.broadcast_to(np.roll(first, 1), normal.shape)
+    )
+    if uv is not None:
+        q = np.asarray(uv, np.float64)[faces]
+        d1, d2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
+        det = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+        mapped = (d1[:, :1] * e2 - d2[:, :1] * e1) * np.sign(det)[:, None]
+        axis = np.where((np.abs(det) > 1e-12)[:, None], mapped, axis)
+    length = np.linalg.norm(axis, axis=1, keepdims=True)
+    edge = e1 / np.maximum(np.linalg.norm(e1, axis=1, keepdims=True), 1e-300)
+    return np.where(length > 1e-9, axis / np.maximum(length, 1e-300), edge)
+
+
+def mesh_from(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    uv: np.ndarray | None = None,
+    warp: tuple[float, float, float] = (0, 1, 0),
+    dtype=jnp.float32,
+) -> Mesh:
+    """Precompute a garment mesh in float64 and store it in `dtype`.
+
+    Args:
+        vertices: (verts, 3) rest positions in m. faces: (faces, 3) vertex indices of a manifold mesh.
+        uv: (verts, 2) texture coordinates, whose v direction is the warp. warp: the warp direction where there is no UV map.
+        dtype: jnp.float32 or jnp.float64.
+
+    Raises:
+        ValueError: an edge has more than two faces, or an index is out of range.
+    """
+    x, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
+    if faces.size and (faces.min() < 0 or faces.max() >= len(x)):
+        raise ValueError(f"faces name vertices {faces.min()} to {faces.max()}, the mesh has {len(x)}")
+    edges, sides, hinges = topology(faces)
+    p = x[faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    normal = np.cross(e1, e2)
+    area = np.linalg.norm(normal, axis=1) / 2
+    u = material_axes(x, faces, uv, warp)
+    v = np.cross(normal / np.maximum(2 * area, 1e-300)[:, None], u)
+    shape = np.stack([[np.sum(a * b, axis=1) for b in (e1, e2)] for a in (u, v)]).transpose(2, 0, 1)
+    longest = np.max([np.sum(e * e, axis=1) for e in (e1, e2, e2 - e1)], axis=0)
+    good = 2 * area > LINE * longest
+    axes = np.linalg.inv(np.where(good[:, None, None], shape, np.eye(2))) * good[:, None, None]
+    area = area * good
+    vertex_area = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(x))
+    length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
+    edge_area = area[sides[:, 0]] + np.where(sides[:, 1] >= 0, area[sides[:, 1]], 0)
+    weight = 2 / np.sqrt(3) * edge_area / np.where(length > 0, length, 1) ** 2 * (length > 0)
+    inner = sides[:, 1] >= 0
+    hinge_area = area[sides[inner]]
+    with jax.enable_x64(True):
+        angle = np.asarray(_rest_angles(jnp.asarray(x), hinges, jnp.asarray(np.where(hinge_area > 0, hinge_area, 1.0))))
+    array = lambda a: jax.device_put(np.asarray(a, dtype))  # noqa: E731, without a program for every shape
+    return Mesh(
+        rest=array(x),
+        faces=jax.device_put(faces),
+        edges=jax.device_put(edges),
+        hinges=jax.device_put(hinges),
+        face_area=array(area),
+        face_axes=array(axes),
+        vertex_area=array(vertex_area),
+        edge_length=array(length),
+        edge_weight=array(weight),
+        hinge_angle=array(angle),
+        hinge_length=array(length[inner]),
+        hinge_area=array(hinge_area),
+        rings=_rings(faces, edges, hinges, sides[inner], len(x), dtype),
+    )
+
+
+@jax.jit
+def _rest_angles(x, hinges, areas):
+    return dihedral(corners(x, hinges), [areas[:, 0], areas[:, 1]])
+
+
+def _rings(faces, edges, hinges, sides, verts: int, dtype) -> Rings:
+    folds, turned = np.full(faces.shape, len(hinges), np.int32), np.ones(faces.shape)
+    each = np.arange(len(hinges))
+    for side in (0, 1):
+        around = faces[sides[:, side]]
+        corner = np.argmax(around == hinges[:, 2 + side, None], axis=1)
+        folds[sides[:, side], corner] = each
+        after = around[each, (corner + 1) % 3]
+        turned[sides[:, side], corner] = np.where(after == hinges[:, side], 1, -1)
+    return Rings(
+        jax.device_put(_places(faces, verts)),
+        jax.device_put(_places(edges, verts)),
+        jax.device_put(folds),
+        jax.device_put(turned.astype(dtype)),
+        jax.device_put(sides.astype(np.int32)),
+        jax.device_put(turned[sides[:, 1], corner].astype(dtype)),
+    )
+
+
+def _places(elements: np.ndarray, verts: int) -> np.ndarray:
+    """Where each vertex stands in the elements, as `Rings` has it."""
+    owner = elements.T.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    counts = np.bincount(owner, minlength=verts)
+    table = np.full((verts, max(int(counts.max(initial=0)), 1)), len(owner), np.int32)
+    slot = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table[owner[order], slot] = order
+    return table
+
+
+def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
+    """Faces around each vertex (verts, most), padded with len(faces): gathering over it replaces a scatter."""
+    places = _places(np.asarray(faces), verts)
+    return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)

@@ -1,0 +1,3 @@
+"""Animated garments: one format a file."""
+
+__all__: list[str] = []

@@ -1,0 +1,134 @@
+"""Animations to and from .npz, .h5, .pc2, .mdd and USD, and to .glb and a folder of .obj files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.animation.glb import write_glb
+from ncs_jax.io.animation.mdd import read_mdd, write_mdd
+from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
+from ncs_jax.io.mesh.obj import format_obj
+from ncs_jax.io.mesh.usd import USD, read_usd_animation, write_usd
+from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
+from ncs_jax.io.tables.files import replacing
+from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
+from ncs_jax.io.tables.npz import read_npz, write_npz
+from ncs_jax.io.tables.table import floats, indices
+
+__all__ = ["read_animation", "write_animation"]
+
+FIELDS = ("vertices", "faces", "fps")
+READABLE = (".npz", ".h5", ".hdf5", ".pc2", ".mdd", *USD)
+FORMATS = (*READABLE, ".glb")
+
+
+def write_animation(
+    path: str | Path,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    fps: float | int,
+    *,
+    rest: ArrayLike | None = None,
+    worn_by: tuple[BodyRecord, MotionRecord] | None = None,
+) -> None:
+    """Write a moving mesh; the suffix says how, and the file or folder appears whole or not at all.
+
+    .npz and .h5 hold `vertices` (T, V, 3) float32, `faces` (F, 3) int32 and `fps`. .pc2 and .mdd hold the vertices only, in the
+    order in which they are given, which is the garment file's: they go onto the mesh of that file. .glb plays in viewers, see
+    `write_glb`; .usd, .usdc, .usda and .usdz hold the rest shape too, see `write_usd`. A path without a suffix, or one that
+    ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces such a folder and no other.
+
+    Args:
+        path: where to. Missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
+        rest: (V, 3) m, the shape at rest, for USD; else that of the first frame. worn_by: the body and its motion of T frames,
+            to go into a .glb too.
+
+    Raises:
+        InputError: the suffix is unknown, or holds no body, the arrays do not fit together or are not finite, or the place
+            cannot be written to.
+    """
+    file = Path(path)
+    suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
+    if suffix and suffix not in FORMATS:
+        raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+    if worn_by is not None and suffix != ".glb":
+        raise InputError(".glb expected, as no other format here holds a body", file=file, value=suffix or "a folder")
+    x = floats(file, "vertices", np.asarray(vertices), ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
+    triangles = indices(file, "faces", np.asarray(faces), ("F", 3), x.shape[1], "vertices")
+    if 0 in x.shape:
+        raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)
+    if not 0 < float(fps) < np.inf:
+        raise InputError("a number above 0 expected", file=file, field="fps", value=fps)
+    if suffix and file.expanduser().is_dir():
+        raise InputError("a file expected", file=file, value="a folder", mend="give another name")
+    if suffix == ".npz":
+        write_npz(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
+    elif suffix == ".pc2":
+        write_pc2(file, x)
+    elif suffix == ".mdd":
+        write_mdd(file, x, float(fps))
+    elif suffix == ".glb":
+        write_glb(file, x, triangles, float(fps), worn_by)
+    elif suffix in USD:
+        given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
+        write_usd(file, x, triangles, float(fps), given)
+    elif suffix:
+        write_hdf5(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
+    else:
+        _write_folder(file, x, triangles, float(fps))
+
+
+def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: float) -> None:
+    text = ("f %d %d %d\n" * len(faces)) % tuple((faces.reshape(-1) + 1).tolist())
+    folder = path.expanduser()
+    with replacing(folder) as part:
+        if folder.exists() and not folder.is_dir():
+            raise InputError("a folder expected", file=path, value="a file", mend="give another name, or a suffix")
+        other = (
+            next((p.name for p in folder.iterdir() if not re.fullmatch(r"frame_\d+\.obj", p.name)), None)
+            if folder.exists()
+            else None
+        )
+        if other is not None:
+            raise InputError("an empty or new folder expected", file=path, value=other, mend="give another name, or a suffix")
+        part.mkdir()
+        for t, x in enumerate(vertices):
+            (part / f"frame_{t:04}.obj").write_text(
+                f"# frame {t} of {len(vertices)} at {fps:g} per second\n{format_obj(x, text)}"
+            )
+
+
+def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: float | int | None = None) -> AnimationRecord:
+    """A moving mesh from .npz, .h5, .pc2, .mdd or USD.
+
+    Args:
+        path: the file. faces, fps: of a .pc2, which holds neither, and faces of an .mdd; without them there are no faces and
+            fps is NaN.
+
+    Raises:
+        InputError: the file cannot be read, its arrays do not fit together, or a number is not finite.
+    """
+    suffix = Path(path).suffix.lower()
+    triangles = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
+    rate = np.nan if fps is None else float(fps)
+    if suffix == ".pc2":
+        file, x = read_pc2(path)
+    elif suffix == ".mdd":
+        file, x, rate = read_mdd(path)
+    elif suffix in USD:
+        file, x, triangles, rate = read_usd_animation(path)
+    elif suffix in READABLE:
+        table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
+        file, x, triangles, rate = table.file, table.array("vertices"), table.array("faces"), table.number("fps")
+    else:
+        mend = "write it as one of these too" if suffix in FORMATS else "convert it"
+        raise InputError(f"one of {', '.join(READABLE)} expected", file=path, value=suffix or "no suffix", mend=mend)
+    x = floats(file, "vertices", x, ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
+    if 0 in x.shape:
+        raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)
+    return AnimationRecord(x, indices(file, "faces", triangles, ("F", 3), x.shape[1], "vertices"), rate)

@@ -1,0 +1,3 @@
+"""Characters and their motions: skeletons, skins, joint rotations; one format a file."""
+
+__all__: list[str] = []

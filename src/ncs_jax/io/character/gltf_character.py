@@ -1,0 +1,305 @@
+"""Characters and animations in glTF 2.0: nodes, skinned meshes and key frames, by the equations of the specification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.io.character.gltf import Gltf, read_gltf
+from ncs_jax.io.character.quaternions import slerp, to_matrix
+from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, motion_of, rig_from, unique_names
+from ncs_jax.io.records import BodyRecord, MotionRecord
+from ncs_jax.io.tables.files import reading
+
+__all__ = ["gltf_body", "gltf_motion"]
+
+DEEPEST = 500  # nodes from the top to a leaf
+PATHS = {"translation": 3, "rotation": 4, "scale": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """All nodes (N): names, parents, local translation, rotation (w first) and scale, and `fixed` matrices, NaN elsewhere."""
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    translation: np.ndarray
+    rotation: np.ndarray
+    scale: np.ndarray
+    fixed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """Keys of one property of one node: times (K,), s, strictly rising; values (K, width), or (3 K, width) for CUBICSPLINE."""
+
+    node: int
+    path: str
+    times: np.ndarray
+    values: np.ndarray
+    mode: str
+
+
+def gltf_body(path: str | Path) -> BodyRecord:
+    """The skinned character of a .glb or .gltf in the pose in which it was bound, m, Y up: see `rig_from`.
+
+    All meshes under a skin are joined, and vertices that only texture coordinates and normals split become one again. Meshes
+    without a skin, morph targets and materials are passed over.
+    """
+    gltf = read_gltf(path)
+    with reading(gltf.file, "glTF"):
+        nodes = _nodes(gltf)
+        pieces = _pieces(gltf)
+        if not pieces:
+            raise gltf.wrong("a skinned mesh expected", "skins", "none", "export the character with its skin")
+        return body_of(rig_from(gltf.file, nodes.names, nodes.parents, _worlds(nodes, range(len(nodes.names))), pieces))
+
+
+def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
+    """An animation of a .glb or .gltf since the pose of `gltf_body`; the first, or that of a name.
+
+    Times are those of the keys where these stand at a constant rate of 10 to 240 a second, else 30 a second from the first key
+    to the last. Joints without keys keep their node's place. Of a file without a skin, the nodes' own pose is at rest.
+    """
+    gltf = read_gltf(path)
+    with reading(gltf.file, "glTF"):
+        nodes = _nodes(gltf)
+        tracks = _tracks(gltf, nodes, name)
+        pieces = _pieces(gltf)
+        turning = sorted({t.node for t in tracks if t.path == "rotation" and np.ptp(t.values, axis=0).max() > 1e-4})
+        rest = _worlds(nodes, range(len(nodes.names)))
+        rig = rig_from(gltf.file, nodes.names, nodes.parents, rest, pieces, turning)
+        return motion_of(rig, _span(tracks), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
+
+
+def _nodes(gltf: Gltf) -> Nodes:
+    given = gltf.objects("nodes")
+    count = len(given)
+    if not 0 < count <= MOST_NODES:
+        raise gltf.wrong(f"1 to {MOST_NODES} nodes expected", "nodes", count, "export one character only")
+    parents = np.full(count, -1, np.int32)
+    for i, node in enumerate(given):
+        for child in gltf.wholes("children", node, f"node {i}", count):
+            if parents[child] >= 0:
+                raise gltf.wrong("one parent for each node expected", f"node {child}", [int(parents[child]), i])
+            parents[child] = i
+    for i in range(count):
+        steps, above = 0, i
+        while (above := int(parents[above])) >= 0:
+            if (steps := steps + 1) > DEEPEST:
+                raise gltf.wrong(f"a tree at most {DEEPEST} nodes deep expected", f"node {i}", "deeper, or a circle")
+    fixed = np.full((count, 4, 4), np.nan)
+    translation, rotation, scale = np.zeros((count, 3)), np.zeros((count, 4)), np.ones((count, 3))
+    for i, node in enumerate(given):
+        translation[i] = gltf.numbers("translation", node, f"node {i}", (0.0, 0.0, 0.0))
+        scale[i] = gltf.numbers("scale", node, f"node {i}", (1.0, 1.0, 1.0))
+        rotation[i] = np.roll(gltf.numbers("rotation", node, f"node {i}", (0.0, 0.0, 0.0, 1.0)), 1)
+        if "matrix" in node:
+            fixed[i] = gltf.numbers("matrix", node, f"node {i}", (0.0,) * 16).reshape(4, 4).T
+    names = unique_names([gltf.text("name", node, f"node {i}") for i, node in enumerate(given)])
+    return Nodes(names, parents, translation, _unit(gltf, rotation, "nodes, rotation"), scale, fixed)
+
+
+def _unit(gltf: Gltf, q: np.ndarray, where: str) -> np.ndarray:
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if (length < 1e-6).any():
+        raise gltf.wrong("quaternions that are not zero expected", where, q[int(np.argmin(length))].tolist())
+    return q / length
+
+
+def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (), times: np.ndarray | None = None) -> np.ndarray:
+    """Node to world, M = M_parent T R S, of the wanted nodes: (n, 4, 4) as they stand, or (times, n, 4, 4)."""
+    line: list[int] = []
+    for node in wanted:  # each after its parents
+        above = []
+        while node >= 0 and node not in line:
+            above.append(node)
+            node = int(nodes.parents[node])
+        line += reversed(above)
+    moved = {(t.node, t.path): _sampled(t, times) for t in tracks if t.node in line}
+    world: dict[int, np.ndarray] = {}
+    for node in line:
+        own = nodes.fixed[node]
+        if np.isnan(own[0, 0]):
+            turn = to_matrix(moved.get((node, "rotation"), nodes.rotation[node]))
+            linear = turn * moved.get((node, "scale"), nodes.scale[node])[..., None, :]
+            place = moved.get((node, "translation"), nodes.translation[node])
+            own = np.zeros((*np.broadcast_shapes(linear.shape[:-2], place.shape[:-1]), 4, 4))
+            own[..., :3, :3], own[..., :3, 3], own[..., 3, 3] = linear, place, 1
+        parent = int(nodes.parents[node])
+        world[node] = own if parent < 0 else world[parent] @ own
+    if times is None:
+        return np.array([world[n] for n in wanted])
+    return np.stack([np.broadcast_to(world[n], (len(times), 4, 4)) for n in wanted], axis=1)
+
+
+def _pieces(gltf: Gltf) -> list[Piece]:
+    """The triangles under each skin."""
+    meshes, skins = gltf.objects("meshes"), gltf.objects("skins")
+    found: dict[int, list] = {}
+    for i, node in enumerate(gltf.objects("nodes")):
+        if "skin" in node and "mesh" in node:
+            skin = gltf.whole("skin", node, f"node {i} skin", len(skins))
+            mesh = gltf.whole("mesh", node, f"node {i} mesh", len(meshes))
+            for p, primitive in enumerate(gltf.objects("primitives", meshes[mesh], f"mesh {mesh}")):
+                if gltf.whole("mode", primitive, f"mesh {mesh}, primitive {p} mode", 7, 4) >= 4:  # not points or lines
+                    found.setdefault(skin, []).append((f"mesh {mesh}, primitive {p}", primitive))
+    return [_piece(gltf, skin, primitives) for skin, primitives in found.items()]
+
+
+def _piece(gltf: Gltf, skin: int, primitives: list[tuple[str, dict]]) -> Piece:
+    one, where = gltf.objects("skins")[skin], f"skin {skin}"
+    joints = np.array(gltf.wholes("joints", one, where, len(gltf.objects("nodes"))), np.int64)
+    if not len(joints):
+        raise gltf.wrong("joints expected", where, "none")
+    if "inverseBindMatrices" not in one:
+        raise gltf.wrong("inverseBindMatrices expected: they say where the joints rest", where, "none")
+    inverse = _floats(gltf, one, "inverseBindMatrices", where, ("MAT4",))
+    if len(inverse) < len(joints):
+        raise gltf.wrong(f"{len(joints)} matrices expected, one a joint", f"{where} inverseBindMatrices", len(inverse))
+    inverse = inverse[: len(joints)].reshape(-1, 4, 4).swapaxes(1, 2)
+    if np.abs(inverse[:, 3] - [0, 0, 0, 1]).max() > 1e-4:
+        raise gltf.wrong("matrices with (0, 0, 0, 1) below expected", f"{where} inverseBindMatrices")
+    parts, start = [], 0
+    for where, primitive in primitives:
+        x, faces, owners, weights = _triangles(gltf, primitive, where, len(joints))
+        parts.append((x, faces + start, owners, weights))
+        start += len(x)
+    width = max(p[2].shape[1] for p in parts)
+    owners, weights = (np.concatenate([np.pad(p[k], ((0, 0), (0, width - p[k].shape[1]))) for p in parts]) for k in (2, 3))
+    return Piece(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), owners, weights, joints, inverse)
+
+
+def _triangles(gltf: Gltf, one: dict, where: str, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3), faces (F, 3), and the joints that move each vertex with their weights (V, 4 or 8)."""
+    attributes = gltf.object("attributes", one, where)
+    if "POSITION" not in attributes and "KHR_draco_mesh_compression" in gltf.object("extensions", one, where):
+        raise gltf.wrong("plain arrays expected", where, "KHR_draco_mesh_compression", "export without mesh compression")
+    x = _floats(gltf, attributes, "POSITION", where, ("VEC3",))
+    owners, weights = [], []
+    for number in range(8):
+        if number and f"JOINTS_{number}" not in attributes:
+            break
+        owner = _array(gltf, attributes, f"JOINTS_{number}", where, ("VEC4",))
+        weight = _floats(gltf, attributes, f"WEIGHTS_{number}", where, ("VEC4",))
+        if owner.dtype.kind != "u" or not len(owner) == len(weight) == len(x):
+            raise gltf.wrong(
+                f"whole numbers and weights for each of the {len(x)} vertices expected", f"{where} JOINTS_{number}",
+                f"{owner.dtype}, {len(owner)} and {len(weight)}",
+            )  # fmt: skip
+        owner = np.where(weight > 0, owner, 0)
+        if (owner >= joints).any():
+            raise gltf.wrong(f"joints from 0 to {joints - 1} expected", f"{where} JOINTS_{number}", int(owner.max()))
+        owners.append(owner.astype(np.int64))
+        weights.append(np.maximum(weight, 0))
+    if "indices" in one:
+        corners = _array(gltf, one, "indices", where, ("SCALAR",))[:, 0]
+        if corners.dtype.kind != "u" or (corners >= len(x)).any():
+            raise gltf.wrong(f"numbers from 0 to {len(x) - 1} expected", f"{where} indices", corners.max(initial=0).item())
+        corners = corners.astype(np.int64)
+    else:
+        corners = np.arange(len(x))
+    if len(corners) < 3:
+        raise gltf.wrong("triangles expected", where, f"{len(corners)} corners")
+    mode = one.get("mode", 4)
+    if mode == 4:
+        faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    elif mode == 5:  # a strip: every other triangle is turned around
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+    else:
+        faces = np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    return x, faces, np.concatenate(owners, axis=1), np.concatenate(weights, axis=1)
+
+
+def _array(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ...]) -> np.ndarray:
+    return gltf.accessor(gltf.whole(name, owner, f"{where} {name}", len(gltf.objects("accessors"))), kinds, f"{where} {name}")
+
+
+def _floats(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ...]) -> np.ndarray:
+    return _array(gltf, owner, name, where, kinds).astype(np.float64)
+
+
+def _tracks(gltf: Gltf, nodes: Nodes, name: str) -> list[Channel]:
+    """The key frames of one animation; those of morph targets and of other properties are passed over."""
+    animations = gltf.objects("animations")
+    names = [gltf.text("name", a, f"animation {i}") for i, a in enumerate(animations)]
+    number = clip_named(gltf.file, names, name)
+    one, where = animations[number], f"animation {number}"
+    samplers = gltf.objects("samplers", one, where)
+    found: dict[tuple[int, str], Channel] = {}
+    for c, channel in enumerate(gltf.objects("channels", one, where)):
+        target = gltf.object("target", channel, f"{where}, channel {c}")
+        path = gltf.text("path", target, f"{where}, channel {c}")
+        if path not in PATHS or "node" not in target:
+            continue
+        node = gltf.whole("node", target, f"{where}, channel {c} node", len(nodes.names))
+        label = f"{where}, {path} of {nodes.names[node]}"
+        if (node, path) in found or not np.isnan(nodes.fixed[node, 0, 0]):
+            raise gltf.wrong("keys once, and of a node without a matrix, expected", label)
+        sampler = samplers[gltf.whole("sampler", channel, f"{label}, sampler", len(samplers))]
+        found[node, path] = _track(gltf, sampler, node, path, label)
+    if not found:
+        raise gltf.wrong("keys of some joint expected", where, "none", f"write FILE#NAME with one of {', '.join(names)[:400]}")
+    return list(found.values())
+
+
+def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Channel:
+    mode = gltf.text("interpolation", sampler, label) or "LINEAR"
+    if mode not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        raise gltf.wrong("LINEAR, STEP or CUBICSPLINE expected", label, mode)
+    times = _floats(gltf, sampler, "input", label, ("SCALAR",))[:, 0]
+    values = _floats(gltf, sampler, "output", label, (f"VEC{PATHS[path]}",))
+    if not len(times) or len(values) != len(times) * (3 if mode == "CUBICSPLINE" else 1):
+        raise gltf.wrong("as many values as times expected (CUBICSPLINE: three)", label, f"{len(values)} for {len(times)}")
+    if times[0] < 0 or (np.diff(times) <= 0).any():
+        raise gltf.wrong("rising times from 0 s expected", label, times[max(int(np.argmin(np.diff(times, prepend=-1))), 0)])
+    if path == "rotation":
+        values = np.roll(values, 1, axis=1)
+        if mode != "CUBICSPLINE":
+            values = _unit(gltf, values, label)
+    return Channel(node, path, times, values, mode)
+
+
+def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
+    """The property (times, width); before the first key and after the last it stands still."""
+    keys, last = track.times, len(track.times) - 1
+    times = np.clip(times, keys[0], keys[-1])
+    low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, last)
+    if track.mode == "STEP" or last == 0:
+        values = track.values[1::3] if track.mode == "CUBICSPLINE" else track.values
+        found = values[low]
+    else:
+        low = np.minimum(low, last - 1)
+        span = keys[low + 1] - keys[low]
+        t = (times - keys[low]) / span
+        if track.mode == "LINEAR" and track.path == "rotation":
+            return slerp(track.values[low], track.values[low + 1], t)
+        t, span = t[:, None], span[:, None]
+        if track.mode == "LINEAR":
+            return track.values[low] * (1 - t) + track.values[low + 1] * t
+        arriving, values, leaving = track.values[::3], track.values[1::3], track.values[2::3]
+        found = (
+            (2 * t**3 - 3 * t**2 + 1) * values[low]
+            + span * (t**3 - 2 * t**2 + t) * leaving[low]
+            + (3 * t**2 - 2 * t**3) * values[low + 1]
+            + span * (t**3 - t**2) * arriving[low + 1]
+        )
+    if track.path == "rotation":
+        found = found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-12)
+    return found
+
+
+def _span(tracks: Sequence[Channel]) -> tuple[float, float, float]:
+    """Begin and end of an animation, s, and its frames per second: those of the keys, or 30."""
+    begin, end = min(float(t.times[0]) for t in tracks), max(float(t.times[-1]) for t in tracks)
+    keys = np.unique(np.concatenate([np.round(t.times, 5) for t in tracks]))
+    if len(keys) > 2:
+        fps = (len(keys) - 1) / (end - begin)
+        even = np.abs(keys - np.linspace(begin, end, len(keys))).max() * fps < 0.01
+        if even and 10 <= fps <= 240:
+            return begin, end, float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else fps
+    return begin, end, 30.0

@@ -1,0 +1,373 @@
+"""A skinned character as 4 x 4 matrices, as .glb and .fbx hold it, and the body and the motion that come of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.character.quaternions import from_matrix, to_axis_angle
+from ncs_jax.io.records import BodyRecord, MotionRecord
+from ncs_jax.io.tables.files import LARGEST
+
+__all__ = ["MOST_NODES", "Piece", "Rig", "body_of", "clip_named", "motion_of", "rig_from", "split_clip", "unique_names"]
+
+GIVE = 0.01  # m that a bone may change, and the share by which a joint may scale, before that is an error and not left out
+MOST_NODES = 20_000  # of a file
+HOUR = 3600.0  # s; the longest animation
+BLOCK = 256  # frames evaluated at once
+SAME = 1e-3  # of the size of the character: bind matrices that differ by less are one
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Triangles under one skin.
+
+    Attributes:
+        vertices: (V, 3) in the space where they were bound. faces: (F, 3). owners, weights: (V, K), numbers into `nodes`, and
+            how much each moves the vertex. nodes: (S,) of the file. inverse_binds: (S, 4, 4) from that space to each node.
+            bound: (4, 4) from that space to the world, where the file says.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    owners: np.ndarray
+    weights: np.ndarray
+    nodes: np.ndarray
+    inverse_binds: np.ndarray
+    bound: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Joints with the places that they were bound in, and the skin, in metres, Y up, in the bind pose.
+
+    Attributes:
+        file: where it is from. nodes: (J,) of the file that are the joints. names: theirs. parents: (J,), -1 for the root.
+            binds: (J, 4, 4) joint to world in the bind pose. used: (J,) moves some vertex, itself or below.
+            vertices: (V, 3). faces: (F, 3). weights: (V, J). Of a file without a skin there are no vertices.
+    """
+
+    file: Path
+    nodes: np.ndarray
+    names: tuple[str, ...]
+    parents: np.ndarray
+    binds: np.ndarray
+    used: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+
+
+def split_clip(path: str | Path) -> tuple[str, str]:
+    """The file and the animation that `FILE.glb#NAME` names; the name is empty where none is given."""
+    found = re.match(r"(.+?\.(?:glb|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
+    return (found[1], found[2] or "") if found else (str(path), "")
+
+
+def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
+    """The number of the animation of a name; the first where none is given."""
+    if not names:
+        raise InputError("an animation expected", file=file, field="animations", value="none", mend="export it with animation")
+    if wanted and wanted not in names:
+        raise InputError(
+            "no such animation", file=file, field="animations", value=wanted,
+            mend=f"write FILE#NAME with one of {', '.join(names)[:400]}",
+        )  # fmt: skip
+    return names.index(wanted) if wanted else 0
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """The same names, with the number of the node added where a name is empty or another's too."""
+    return tuple(n if n and names.count(n) == 1 else f"{n or 'node'}_{i}" for i, n in enumerate(names))
+
+
+def rig_from(
+    file: Path,
+    names: Sequence[str],
+    parents: np.ndarray,
+    rest: np.ndarray,
+    pieces: Sequence[Piece],
+    turning: Sequence[int] = (),
+) -> Rig:
+    """Put joints and pieces together in one rest pose, the one in which the skin was bound.
+
+    Joints rest where the inverse bind matrices say and not where the nodes stand: only from there do the joints' movements give
+    the skin as the file means it. Nodes may stand in any pose; exporters leave some frame in them. How the bound character
+    stands in the world is what the joints' nodes agree on, where they are in the bind pose; else where the file says that the
+    skin was bound (FBX); else the place of the root's node, and the turn of the armature or the quarter turns that are
+    nearest to how the joints have turned on the whole.
+
+    The root is the lowest node above all joints that move a vertex. A root bone of the file, which moves none and below which
+    the pelvis moves, is no joint, nor are controls beside it.
+
+    Args:
+        file: for errors. names, parents, rest: of all nodes (N,), (N,), (N, 4, 4) node to world. pieces: at least one of which
+            has a vertex; where there is none, the joints are the nodes above, between and below those `turning`, at rest.
+    """
+    if not pieces:
+        if not len(turning):
+            raise InputError(
+                "a skin, or nodes that turn, expected", file=file, field="nodes", mend="export a skinned character"
+            )
+        root = _common(parents, turning)
+        joints = _by_depth(parents, [n for n in range(len(parents)) if root in _line(parents, n)])
+        none = np.zeros((0, 3))
+        used = np.ones(len(joints), bool)
+        above = _parents(parents, joints)
+        own = unique_names([names[n] for n in joints])
+        return Rig(file, np.array(joints), own, above, rest[joints], used, none, none.astype(np.int32), none[:, :0])
+    for piece in pieces:
+        _check(file, names, piece)
+    moving = {int(p.nodes[k]) for p in pieces for k in np.unique(p.owners[p.weights > 0])}
+    root = _common(parents, sorted(moving))
+    if root < 0:
+        raise InputError("one skeleton expected", file=file, field="nodes", value="several", mend="export one character")
+    listed = {int(n) for p in pieces for n in p.nodes}
+    joints = _by_depth(parents, [n for n in listed | {root} if root in _line(parents, n)])
+    place = {n: j for j, n in enumerate(joints)}
+    binds: dict[int, np.ndarray] = {}
+    bodies = []
+    for piece in sorted(pieces, key=lambda p: -len(p.vertices)):
+        to_world = _to_world(file, names, parents, rest, piece, binds)
+        for node, inverse in zip(piece.nodes.tolist(), piece.inverse_binds, strict=True):
+            if node in place:
+                binds.setdefault(node, to_world @ np.linalg.inv(inverse))
+        bodies.append(_placed(piece, to_world, place))
+    vertices, faces, weights = _joined(file, bodies, len(joints))
+    above = _parents(parents, joints)
+    used = np.array([n in moving for n in joints])
+    for j in range(len(joints) - 1, 0, -1):
+        used[above[j]] |= used[j]
+    return Rig(
+        file, np.array(joints), unique_names([names[n] for n in joints]), above, _all_binds(joints, above, rest, binds), used,
+        vertices, faces, weights,
+    )  # fmt: skip
+
+
+def _check(file: Path, names: Sequence[str], piece: Piece) -> None:
+    sums = np.maximum(piece.weights, 0).sum(axis=1)
+    bad = ~(np.abs(sums - 1) < 0.1)
+    if bad.any():
+        v = int(bad.argmax())
+        raise InputError(
+            "weights that sum to 1 expected", file=file, field=f"skin, vertex {v} of the mesh", value=float(sums[v]),
+            mend="normalise the skinning weights, and give every vertex to some joint",
+        )  # fmt: skip
+    with np.errstate(all="ignore"):
+        flat = ~(np.abs(np.linalg.det(piece.inverse_binds[:, :3, :3])) > 1e-18)
+    if flat.any():
+        raise InputError(
+            "matrices that can be inverted expected", file=file, value=piece.inverse_binds[flat.argmax()].tolist(),
+            field=f"inverse bind matrix of {names[int(piece.nodes[flat.argmax()])]}", mend="export the file again",
+        )  # fmt: skip
+
+
+def _line(parents: np.ndarray, node: int) -> list[int]:
+    """A node, its parent, and so on to the top."""
+    line = [node]
+    while (node := int(parents[node])) >= 0:
+        line.append(node)
+    return line
+
+
+def _common(parents: np.ndarray, nodes: Sequence[int]) -> int:
+    """The lowest node that is each of these or above it; -1 where there is none."""
+    shared = _line(parents, nodes[0])
+    for node in nodes[1:]:
+        line = set(_line(parents, node))
+        shared = [n for n in shared if n in line]
+    return shared[0] if shared else -1
+
+
+def _by_depth(parents: np.ndarray, nodes: Sequence[int]) -> list[int]:
+    return sorted(nodes, key=lambda n: (len(_line(parents, n)), n))
+
+
+def _parents(parents: np.ndarray, joints: list[int]) -> np.ndarray:
+    """The nearest joint above each; nodes between them move with it or are seen in the joint's own movement."""
+    place = {n: j for j, n in enumerate(joints)}
+    return np.array([next((place[n] for n in _line(parents, j)[1:] if n in place), -1) for j in joints], np.int32)
+
+
+def _to_world(
+    file: Path, names: Sequence[str], parents: np.ndarray, rest: np.ndarray, piece: Piece, binds: dict[int, np.ndarray]
+) -> np.ndarray:
+    """The matrix (4, 4) from the space in which a piece was bound to the world in which it stands."""
+    moving = sorted(np.unique(piece.owners[piece.weights > 0]), key=lambda k: len(_line(parents, int(piece.nodes[k]))))
+    known = [k for k in moving if int(piece.nodes[k]) in binds]
+    seen = known or moving
+    worlds = np.array([binds[int(piece.nodes[k])] if known else rest[piece.nodes[k]] for k in seen])
+    found = worlds @ piece.inverse_binds[seen]
+    low = piece.vertices.min(axis=0)
+    corners = low + np.ptp(piece.vertices, axis=0).max() * np.eye(4, 3)  # one of a cube around it, and the three beside that
+    ends = np.einsum("kab,nb->kna", found[:, :3, :3], corners) + found[:, None, :3, 3]
+    size = np.linalg.norm(ends[:, 1] - ends[:, 3], axis=1).max()
+    apart = np.abs(ends - ends[:1]).max(axis=(1, 2))
+    if apart.max() <= SAME * size:
+        return found[0]
+    if known:
+        raise InputError(
+            "one bind pose for all meshes expected", file=file, value=f"{apart.max():.3g} m apart",
+            field=f"joint {names[int(piece.nodes[seen[int(apart.argmax())]])]}",
+            mend="join the meshes of the character, or export one character",
+        )  # fmt: skip
+    if piece.bound is not None:
+        return piece.bound
+    share = np.bincount(piece.owners.ravel(), piece.weights.ravel(), len(piece.nodes))[moving]
+    highest, armature = rest[piece.nodes[moving[0]]], int(parents[piece.nodes[moving[0]]])
+    out = _upright(found, share, rest[armature] if armature >= 0 else np.eye(4))
+    out[:3, 3] = highest[:3, 3] - out[:3, :3] @ np.linalg.inv(piece.inverse_binds[moving[0]])[:3, 3]
+    return out
+
+
+def _upright(ways: np.ndarray, share: np.ndarray, armature: np.ndarray) -> np.ndarray:
+    """Scale of the first way (K, 4, 4) from bound space to world, and the turn of the armature's node or the quarter turns,
+    whichever is nearest to the mean turn of all ways."""
+    left, _, right = np.linalg.svd(ways[:, :3, :3])
+    turn = np.einsum("j,jab->ab", share, left @ right)
+    candidates = _quarter_turns(np.sign(np.linalg.det(ways[0, :3, :3])))
+    left, _, right = np.linalg.svd(armature[:3, :3])
+    candidates.append(left @ right)
+    out = np.eye(4)
+    out[:3, :3] = max(candidates, key=lambda q: float((q * turn).sum())) * np.cbrt(abs(np.linalg.det(ways[0, :3, :3])))
+    return out
+
+
+def _quarter_turns(sign: float) -> list[np.ndarray]:
+    """The 24 rotations that map axes to axes, or the 24 that mirror too."""
+    found = []
+    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+        for signs in np.ndindex(2, 2, 2):
+            q = np.zeros((3, 3))
+            q[np.arange(3), order] = 1 - 2 * np.array(signs)
+            if np.linalg.det(q) * sign > 0:
+                found.append(q)
+    return found
+
+
+def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    x = piece.vertices @ to_world[:3, :3].T + to_world[:3, 3]
+    faces = piece.faces if np.linalg.det(to_world[:3, :3]) > 0 else piece.faces[:, ::-1]
+    number = np.array([place.get(int(n), 0) for n in piece.nodes])
+    return x, faces, number[np.where(piece.weights > 0, piece.owners, 0)], piece.weights
+
+
+def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and dense weights of all pieces; vertices at one place (to 1 um) that move alike become one."""
+    count = sum(len(b[0]) for b in bodies)
+    if count * joints * 8 > LARGEST:
+        raise InputError("a smaller body expected", file=file, field="skin", value=f"{count} vertices, {joints} joints")
+    starts = np.cumsum([0] + [len(b[0]) for b in bodies[:-1]])
+    x = np.concatenate([b[0] for b in bodies])
+    faces = np.concatenate([b[1] + s for b, s in zip(bodies, starts, strict=True)])
+    weights = np.zeros((count, joints))
+    for start, (_, _, owners, own) in zip(starts, bodies, strict=True):
+        np.add.at(weights, (start + np.arange(len(own))[:, None], owners), np.maximum(own, 0))
+    weights /= weights.sum(axis=1, keepdims=True)
+    key = np.concatenate([np.round(x * 1e6), np.round(weights * 1e4)], axis=1)
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")  # in the order in which the places first appear
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    faces = rank[number.reshape(-1)][faces]
+    kept = first[order]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    if not whole.any():
+        raise InputError("triangles expected", file=file, field="skin", value="none", mend="export the character's mesh")
+    return x[kept], faces[whole].astype(np.int32), weights[kept]
+
+
+def _all_binds(joints: list[int], parents: np.ndarray, rest: np.ndarray, binds: dict[int, np.ndarray]) -> np.ndarray:
+    """Where no skin binds a joint, it stands to its nearest bound relative as its node does."""
+    found = {j: binds[n] for j, n in enumerate(joints) if n in binds}
+    children = [(int(parents[j]), j) for j in range(len(joints) - 1, 0, -1)]
+    for here, other in children + [(j, p) for p, j in reversed(children)]:
+        if here not in found and other in found:
+            found[here] = found[other] @ np.linalg.pinv(rest[joints[other]]) @ rest[joints[here]]
+    return np.array([found[j] for j in range(len(joints))])
+
+
+def _rest_rotations(rig: Rig) -> np.ndarray:
+    """(J, 3, 3) the rotation nearest to each bind matrix."""
+    left, _, right = np.linalg.svd(rig.binds[:, :3, :3])
+    turns = left @ right
+    return turns * np.sign(np.linalg.det(turns))[:, None, None]
+
+
+def body_of(rig: Rig) -> BodyRecord:
+    """The character at rest, which is the pose that its skin was bound in."""
+    if not len(rig.vertices):
+        raise InputError("a skinned mesh expected", file=rig.file, field="skins", value="none", mend="export it with its skin")
+    return BodyRecord(
+        rig.vertices, rig.faces, rig.binds[:, :3, 3].copy(), rig.parents, rig.weights, rig.names, _rest_rotations(rig)
+    )
+
+
+def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.ndarray], np.ndarray]) -> MotionRecord:
+    """Local rotations since rest, in the joints' own rest frames, of joints that move as a file says.
+
+    A joint has turned by G_j = A_j B_j^-1, its matrix now by its bind matrix, and in its own frame, as seen from its parent, by
+    R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation.
+
+    Args:
+        rig: whose joints. times: begin and end, s, and frames per second. worlds: (n,) s to (n, J, 4, 4) joint to world.
+
+    Raises:
+        InputError: it lasts an hour, a joint scales by more than 1 % or a bone's length or place by more than 1 cm; the rest of
+            these is left out. Joints that move no vertex may do both.
+    """
+    begin, end, fps = times
+    count = int(np.floor((end - begin) * fps + 1e-3)) + 1 if end - begin < HOUR else 0
+    if count < 1 or count * len(rig.names) * 24 > LARGEST:
+        raise InputError(
+            "an animation of less than an hour expected", file=rig.file, field="animations", value=f"{end - begin:.6g} s",
+            mend="cut it into several",
+        )  # fmt: skip
+    rest, joints = _rest_rotations(rig), rig.binds[:, :3, 3]
+    back, above = np.linalg.pinv(rig.binds), rig.parents[1:]
+    turned, moved = [], []
+    for first in range(0, count, BLOCK):
+        at = worlds(begin + np.arange(first, min(first + BLOCK, count)) / fps)
+        world = _rotations(rig, (at @ back)[..., :3, :3], first)
+        place = at[..., :3, 3]
+        bones = np.einsum("tjab,jb->tja", world[:, above], joints[1:] - joints[above])
+        _check_bones(rig, place[:, 1:] - place[:, above] - bones, first)
+        local = world.copy()
+        local[:, 1:] = np.swapaxes(world[:, above], -1, -2) @ world[:, 1:]
+        turned.append(to_axis_angle(from_matrix(np.swapaxes(rest, -1, -2) @ local @ rest)))
+        moved.append(place[:, 0] - joints[0])
+    return MotionRecord(np.concatenate(turned), np.concatenate(moved), fps, rig.names, joints, rig.parents, rest_rotations=rest)
+
+
+def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
+    """The rotations in (T, J, 3, 3), which the joints in use must be but for rounding; of the others, what is one."""
+    with np.errstate(all="ignore"):
+        scale = np.cbrt(np.linalg.det(linear))
+        turns = linear / scale[..., None, None]
+        square = np.swapaxes(turns, -1, -2) @ turns
+        bad = ~((np.abs(scale - 1) < GIVE) & (np.abs(square - np.eye(3)).max(axis=(-1, -2)) < 2 * GIVE))
+        for _ in range(3):  # to the nearest rotation (Higham 1986, Newton-Schulz)
+            turns = turns @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(turns, -1, -2) @ turns)
+    if (bad & rig.used).any():
+        t, j = (int(i) for i in np.argwhere(bad & rig.used)[0])
+        raise InputError(
+            "rotations without scale expected", file=rig.file, field=f"animation, frame {t + first}, joint {rig.names[j]}",
+            value=f"scaled by {float(scale[t, j]):.4g}, or sheared", mend="apply scale, and animate rotations only",
+        )  # fmt: skip
+    return np.where(bad[..., None, None], np.eye(3), turns)
+
+
+def _check_bones(rig: Rig, off: np.ndarray, first: int) -> None:
+    far = np.where(rig.used[1:], np.linalg.norm(off, axis=-1), 0)
+    if far.max(initial=0) > GIVE or not np.isfinite(far).all():
+        t, j = (int(i) for i in np.unravel_index(np.argmax(np.where(np.isfinite(far), far, np.inf)), far.shape))
+        raise InputError(
+            "bones of fixed length expected, as in the bind pose", file=rig.file,
+            field=f"animation, frame {t + first}, joint {rig.names[j + 1]}", value=f"{far[t, j]:.3g} m from its place",
+            mend="animate rotations only, but for the root",
+        )  # fmt: skip

@@ -1,0 +1,3 @@
+"""Garment meshes: one format a file."""
+
+__all__: list[str] = []

@@ -1,0 +1,111 @@
+"""Wavefront .obj. Vertices keep the file's order and number: texture seams and normals do not split them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.tables.files import text_of
+
+__all__ = ["format_obj", "read_obj"]
+
+
+def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
+    """The file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2).
+
+    Polygons are cut as `triangulate` says, negative numbers count back from the last vertex, and objects, groups,
+    materials, normals, lines and points are passed over. Texture coordinates are None where a vertex has none, or two that
+    differ.
+    """
+    file, text = text_of(path)
+    vertices: list[list[float]] = []
+    coordinates: list[list[float]] = []
+    counts: list[int] = []
+    corners: list[tuple[int, int]] = []  # (vertex, texture coordinate)
+    for line, words in _lines(text):
+        if words[0] == "v":
+            vertices.append(_numbers(file, line, words, 3))
+        elif words[0] == "vt":
+            coordinates.append(_numbers(file, line, words, 2))
+        elif words[0] == "f":
+            polygon = [_corner(file, line, word, len(vertices), len(coordinates)) for word in words[1:]]
+            if len(polygon) < 3:
+                raise InputError("three corners or more expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
+            counts.append(len(polygon))
+            corners.extend(polygon)
+    x = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    cut = triangulate(file, x, np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2)[:, 0])
+    return file, x, cut, _per_vertex(len(x), coordinates, corners)
+
+
+def _lines(text: str):
+    """Line number and words of each line that says something; a backslash joins a line with the next."""
+    kept: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#", 1)[0].split()
+        if words and words[-1].endswith("\\"):
+            kept += [*words[:-1], words[-1][:-1]] if len(words[-1]) > 1 else words[:-1]
+            continue
+        words, kept = kept + words, []
+        if words:
+            yield number, words
+    if kept:
+        yield number, kept
+
+
+def _numbers(file: Path, line: int, words: list[str], count: int) -> list[float]:
+    try:
+        numbers = [float(w) for w in words[1 : count + 1]]
+    except ValueError:
+        numbers = []
+    if words[0] == "vt" and len(numbers) == 1:
+        numbers.append(0.0)
+    if len(numbers) != count:
+        raise InputError(f"{count} numbers expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
+    return numbers
+
+
+def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -> tuple[int, int]:
+    """Numbers from 0 of a corner's vertex and texture coordinate (-1: none) in `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
+    parts = word.split("/")
+    try:
+        vertex = int(parts[0])
+        coordinate = int(parts[1]) if len(parts) > 1 and parts[1] else None
+    except ValueError:
+        raise InputError("v, v/vt, v//vn or v/vt/vn expected", file=file, field=f"line {line}", value=word[:60]) from None
+    v = vertex - 1 if vertex > 0 else vertices + vertex
+    if vertex == 0 or not 0 <= v < vertices:
+        raise InputError(
+            f"a vertex from 1 to {vertices} expected, of those above", file=file, field=f"faces, line {line}", value=vertex,
+            mend="counting starts at 1; export the mesh again",
+        )  # fmt: skip
+    if coordinate is None:
+        return v, -1
+    t = coordinate - 1 if coordinate > 0 else coordinates + coordinate
+    if coordinate == 0 or not 0 <= t < coordinates:
+        raise InputError(
+            f"a texture coordinate from 1 to {coordinates} expected, of those above", file=file, field=f"faces, line {line}",
+            value=coordinate, mend="export the mesh again, or without texture coordinates",
+        )  # fmt: skip
+    return v, t
+
+
+def _per_vertex(count: int, coordinates: list[list[float]], corners: list[tuple[int, int]]) -> np.ndarray | None:
+    if not coordinates or not corners:
+        return None
+    table = np.array(coordinates, dtype=np.float64)
+    v, t = np.array(corners).T
+    if (t < 0).any() or len(np.unique(v)) != count:
+        return None
+    uv = np.empty((count, 2))
+    uv[v] = table[t]
+    return uv if np.array_equal(uv[v], table[t], equal_nan=True) else None
+
+
+def format_obj(vertices: np.ndarray, faces: str) -> str:
+    """One frame as text; `faces` is text already, as it is the same in every frame."""
+    flat = np.asarray(vertices, dtype=np.float64).reshape(-1)
+    return ("v %.9g %.9g %.9g\n" * len(vertices)) % tuple(flat.tolist()) + faces

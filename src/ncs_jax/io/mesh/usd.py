@@ -1,0 +1,188 @@
+"""Universal Scene Description (.usd, .usdc, .usda, .usdz), through usd-core: meshes in, animations in and out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.mesh import usd_arrays
+from ncs_jax.io.mesh.axes import TURNS, upright
+from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.tables.files import LARGEST, readable, reading, replacing
+from ncs_jax.io.tables.table import floats, indices
+
+__all__ = ["USD", "UsdMesh", "read_usd_animation", "read_usd_mesh", "write_usd"]
+
+USD = (".usd", ".usdc", ".usda", ".usdz")
+
+
+@dataclass(frozen=True, eq=False)
+class UsdMesh:
+    """Vertices (V, 3) in the stage's world, triangles (F, 3), metres a unit, and the axis that is up: "y" or "z"."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    scale: float
+    up: str
+
+
+# --- in ---------------------------------------------------------------------------------------------------------------------
+
+
+def read_usd_mesh(path: str | Path) -> tuple[Path, UsdMesh]:
+    """All meshes of a file as one, at rest (the default time) or, where they only move, at their first time sample.
+
+    Transforms are applied, polygons become triangles, and the cage of a subdivision surface is taken as it is. Vertices keep
+    the file's order, mesh after mesh.
+    """
+    file, table = _arrays(path, "still")
+    x, faces = _joined(file, table)
+    return file, UsdMesh(x[0], faces, float(table["scale"]), str(table["up"]))
+
+
+def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, float]:
+    """The file, positions (T, V, 3) of every time sample in m and Y up, triangles (F, 3), and frames per second."""
+    file, table = _arrays(path, "moving")
+    steps = np.diff(table["times"])
+    if not len(table["times"]) or not np.allclose(steps, steps[:1], rtol=0.01):
+        raise InputError(
+            "points with time samples in even steps expected", file=file, field="points", value=table["times"][:4].tolist(),
+            mend="export the animation with a sample in every frame",
+        )  # fmt: skip
+    x, faces = _joined(file, table)
+    rate = float(table["rate"]) / (steps[0] if len(steps) else 1.0)
+    return file, upright(x, float(table["scale"]), str(table["up"])), faces, rate
+
+
+def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
+    """What the program `usd_arrays` finds, which ends where the file makes it take more memory or time than is sane."""
+    file = readable(path)
+    _installed(file)
+    size = file.stat().st_size
+    memory, seconds = min(2 * 2**30 + 64 * size, 3 * LARGEST), 60 + size // 10**6
+    with reading(file, "USD"), tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "arrays.npz"
+        command = [sys.executable, "-P", usd_arrays.__file__, str(file.absolute()), str(out), kind, str(memory)]
+        one = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "1"}  # each thread reserves memory
+        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False, env=one)
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise OSError(said[-1] if done.returncode == 1 and said else "usd-core breaks off")
+        with np.load(out, allow_pickle=False) as table:
+            found = dict(table)
+    if "0.points" not in found:
+        raise InputError("a mesh expected", file=file, field="prims", value="no Mesh", mend="export the garment's mesh")
+    for name, good, expected in (
+        ("upAxis", found["up"] in tuple(TURNS), "X, Y or Z"),
+        ("metersPerUnit", 0 < found["scale"] < np.inf, "a number above 0"),
+        ("timeCodesPerSecond", 0 < found["rate"] < np.inf, "a number above 0"),
+    ):
+        if not good:
+            raise InputError(f"{expected} expected", file=file, field=name, mend="mend it where the stage was made")
+    return file, found
+
+
+def _joined(file: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, V, 3) in the world and triangles (F, 3) of all meshes."""
+    parts, faces, start = [], [], 0
+    for i in range(sum(key.endswith(".points") for key in table)):
+        name, turn = str(table[f"{i}.name"]), table[f"{i}.turn"]
+        x = floats(file, f"{name}.points", table[f"{i}.points"], ("T", "V", 3), ("frame", "vertex"))
+        if not np.array_equal(turn, np.broadcast_to(np.eye(4), turn.shape)):
+            x = np.einsum("tvi,tij->tvj", x.astype(np.float64), turn[:, :3, :3]) + turn[:, None, 3, :3]
+        corners = indices(file, f"{name}.faceVertexIndices", table[f"{i}.corners"], ("N",), x.shape[1], "points")
+        triangles = triangulate(file, x[0], table[f"{i}.counts"], corners, skip=table[f"{i}.holes"])
+        if table[f"{i}.left"] != (np.linalg.det(turn[0, :3, :3]) < 0):
+            triangles = triangles[:, ::-1]
+        parts.append(x)
+        faces.append(triangles + start)
+        start += x.shape[1]
+    return np.concatenate(parts, axis=1), np.concatenate(faces)
+
+
+def _installed(file: Path) -> None:
+    if find_spec("pxr") is None:
+        raise InputError(
+            "the package usd-core is needed for USD", file=file, mend="pip install 'ncs-jax[usd]', or take another format"
+        )
+
+
+# --- out --------------------------------------------------------------------------------------------------------------------
+
+
+def write_usd(path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray) -> None:
+    """Write a moving mesh, /garment, in metres and Y up; the file appears whole or not at all.
+
+    `points`, `normals` and `extent` have a time sample a frame, at 0, 1, 2 ..., with fps time codes a second; the default value
+    of `points` is the rest shape. .usda is text, the others are binary; .usdz is that in a package, as phones show it.
+
+    Args:
+        path: where to. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second. rest: (V, 3) m.
+    """
+    file = Path(path)
+    _installed(file)
+    suffix = file.suffix.lower()
+    with replacing(file) as part, _quietly(), tempfile.TemporaryDirectory(dir=part.parent, prefix=part.name) as folder:
+        from pxr import Usd, UsdUtils
+
+        inner = Path(folder) / f"{file.stem}{'.usdc' if suffix == '.usdz' else suffix}"
+        stage = Usd.Stage.CreateNew(str(inner))
+        _fill(stage, vertices, faces, fps, rest)
+        stage.GetRootLayer().Save()
+        del stage
+        if suffix == ".usdz":
+            if not UsdUtils.CreateNewUsdzPackage(str(inner), str(part)):
+                raise OSError("usd-core could not pack it")
+        else:
+            inner.replace(part)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """What usd-core raises is an OSError of one line, and what it warns of is not printed."""
+    from pxr import Tf, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    except Tf.ErrorException as error:
+        said = str(error).strip().rsplit(" : '", 1)[-1].strip("'")
+        raise OSError(f"usd-core says {' '.join(said.split())[:200]}") from None
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+
+
+def _fill(stage, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray) -> None:
+    from pxr import Gf, Usd, UsdGeom, Vt
+
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(vertices) - 1)
+    mesh = UsdGeom.Mesh.Define(stage, "/garment")
+    stage.SetDefaultPrim(mesh.GetPrim())
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(0.32, 0.47, 0.65)])
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
+    for when, x in [(Usd.TimeCode.Default(), rest), *((Usd.TimeCode(t), x) for t, x in enumerate(vertices))]:
+        x = np.ascontiguousarray(x, np.float32)
+        points.Set(Vt.Vec3fArray.FromNumpy(x), when)
+        normals.Set(Vt.Vec3fArray.FromNumpy(vertex_normals(x, faces)), when)
+        extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([x.min(axis=0), x.max(axis=0)])), when)

@@ -1,0 +1,198 @@
+"""What an animation is worth, in physical quantities, frame by frame."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.bending import angles
+from ncs_jax.energies.contact.distance import triangle_distance
+from ncs_jax.energies.contact.intersections import intersecting
+from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.pairs import Groups, groups_from
+from ncs_jax.energies.contact.surface import Surface, surface_from
+from ncs_jax.energies.gravity import gravity
+from ncs_jax.energies.membrane import deformation
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import contact_force, distances, energies
+from ncs_jax.geometry.mesh import corners
+from ncs_jax.geometry.numerics import angle_between, arctan2, norm
+from ncs_jax.geometry.skinning import blend, skin, unpose
+from ncs_jax.geometry.soa_vectors import cross, dot, length
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model, pose_body
+
+__all__ = ["QUANTITIES", "measure", "summarise"]
+
+# name: unit and what it is
+QUANTITIES = {
+    "strain_mean": ("%", "mean |l/l0 - 1| over the edges"),
+    "strain_p99": ("%", "99th percentile of |l/l0 - 1| over the edges"),
+    "shear_mean": ("deg", "mean deviation of warp and weft from a right angle, by area"),
+    "hinge_mean": ("deg", "mean |phi - phi_rest| over the hinges"),
+    "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
+    "depth_max": ("mm", "deepest penetration"),
+    "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
+    "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
+    "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
+}
+
+DEEPEST = 64  # points of a frame that are asked a second time whether they are inside
+
+
+def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3 3"]) -> Float[Array, "points"]:
+    """How many times a surface encloses each point: 1 within a closed one, 0 outside; where it is open, by how much.
+
+    The sum of the triangles' solid angles, w = sum_f 2 atan2(a . (b x c), |a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|) /
+    (4 pi), with a, b, c from the point to the corners. Sources: van Oosterom and Strackee 1983; Jacobson et al. 2013.
+    """
+    a, b, c = ([triangles[None, :, k, i] - x[:, None, i] for i in range(3)] for k in range(3))
+    la, lb, lc = map(length, (a, b, c))
+    below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+    return jnp.sum(arctan2(dot(a, cross(b, c)), below), axis=-1) / (2 * np.pi)
+
+
+def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
+    """How deep points are inside, m, by exact point-triangle distance.
+
+    Of a garment worn below, `layered`, a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
+    points inward. The deepest points are therefore asked a second time: only what it also encloses is inside.
+    """
+    index, _ = nearest_triangle(x, body, surface)
+    depth = -triangle_distance(x, body, surface, index)
+    if not layered:
+        return depth
+    deepest, at = lax.top_k(depth, min(DEEPEST, len(depth)))
+    inside = winding_number(x[at], body[surface.faces]) > 0.5
+    return depth.at[at].set(jnp.where(inside, deepest, -jnp.abs(deepest)))
+
+
+def _frame(
+    model: Model, exact: bool, groups: Groups | None, middles: Surface | None, x, previous, before, matrices, matrices_before
+) -> dict[str, Float[Array, ""]]:
+    mesh, terms = model.garment.mesh, model.terms
+    origin = matrices[:1, :, 3]  # seen from the root joint, where single precision is finest
+    x, previous, before = x - origin, previous - origin, before - origin
+    matrices, matrices_before = matrices.at[:, :, 3].add(-origin), matrices_before.at[:, :, 3].add(-origin)
+    body = None if model.body is None else pose_body(model, matrices)
+    blended = blend(matrices, model.blend) if terms.pinning else None
+    carried = pressed = None
+    if terms.friction:
+        carried = skin(blend(matrices, model.blend), unpose(blend(matrices_before, model.blend), previous))
+        pressed = contact_force(carried, body, model.surface, terms, model.material)
+    frame = StepInputs(1 / model.fps, previous, before, body, blended, carried, pressed)
+
+    def value(x):
+        parts = energies(x, model.garment, model.material, frame, terms, model.surface)
+        return sum(parts.values()), parts
+
+    (total, parts), gradient = jax.value_and_grad(value, has_aux=True)(x)
+    mass = model.material.density * mesh.vertex_area
+    if terms.gravity:
+        lifted = gravity(origin, jnp.sum(mass, keepdims=True), model.material.gravity)
+        total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
+    heavy = mass > 0
+    square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
+    strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+    warp, weft = (jnp.stack(w, axis=-1) for w in deformation(x, mesh))
+    shear = jnp.abs(angle_between(warp, weft) - np.pi / 2)
+    bend = angles(corners(x, mesh.hinges), mesh)
+    result = {
+        "total": total,
+        **parts,
+        "strain_mean": 100 * jnp.mean(strain),
+        "strain_p99": 100 * jnp.percentile(strain, 99),
+        "shear_mean": jnp.degrees(jnp.sum(mesh.face_area * shear) / jnp.sum(mesh.face_area)),
+        "hinge_mean": jnp.degrees(jnp.mean(jnp.abs(bend))),
+        "out_of_balance": jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81,
+    }
+    if model.surface is not None:
+        if exact:
+            depth = _depth(x, body, model.surface, bool(model.under))
+        else:
+            depth = -distances(x, body, model.surface, terms)
+        result["penetrating"] = 100 * jnp.mean(depth > 0)
+        result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
+        if middles is not None:
+            between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
+            deepest = jnp.max(_depth(between, body, middles, bool(model.under)))
+            result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
+    if groups is not None:
+        through, overflow = intersecting(x, mesh, groups)
+        result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
+    return result
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _measure(model, exact, groups, middles, *frames):
+    return lax.map(lambda frame: _frame(model, exact, groups, middles, *frame), frames)
+
+
+def _middles(model: Model) -> Surface:
+    """What the search for the nearest triangle knows of the middles of the edges."""
+    mesh = model.garment.mesh
+    between = np.asarray((mesh.rest[mesh.edges[:, 0]] + mesh.rest[mesh.edges[:, 1]]) / 2)
+    body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
+    return surface_from(between, body, np.asarray(model.surface.faces))
+
+
+_SUMMARY: dict[str, Callable[..., np.floating]] = {
+    "depth_max": np.max, "middle_depth_max": np.max, "out_of_balance": np.median,
+}  # fmt: skip
+
+BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
+
+
+def measure(
+    model: Model,
+    vertices: Float[Array | np.ndarray, "frames verts 3"],
+    track: MotionFeatures,
+    *,
+    exact: bool = True,
+    self_contact: bool | None = None,
+) -> dict[str, np.ndarray]:
+    """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
+
+    Args:
+        vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
+
+        exact: penetration by the exact signed distance to the body's triangles, also of the middles of the edges; else by the
+            scene's own query, which is faster.
+        self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
+
+    Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
+    taken to have been at rest.
+    """
+    frames = len(vertices)
+    positions = track.relative(np.asarray(vertices)).astype(model.basis.dtype, copy=False)
+    groups = None
+    if model.terms.self_contact if self_contact is None else self_contact:
+        groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups
+
+    middles = _middles(model) if exact and model.surface is not None else None
+
+    def block(first):
+        t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
+        three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
+        return jax.device_get(
+            _measure(model, exact, groups, middles, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)])
+        )
+
+    first, *others = range(0, frames, BLOCK)
+    blocks = [block(first)]  # compiles
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps only one core busy
+        blocks += pool.map(block, others)
+    return {name: np.concatenate([b[name] for b in blocks])[:frames] for name in blocks[0]}
+
+
+def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means over frames or motions; the largest for `depth_max` and `middle_depth_max`, the median for `out_of_balance`."""
+    return {name: float(_SUMMARY.get(name, np.mean)(values)) for name, values in rows.items()}

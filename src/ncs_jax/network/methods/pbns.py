@@ -1,0 +1,60 @@
+"""Physically based neural simulator: a pose gives a shape, and nothing has mass times acceleration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from ncs_jax.energies.terms import Terms
+from ncs_jax.network.decoder import Decoder
+from ncs_jax.network.encoders import StaticEncoder
+from ncs_jax.network.methods.method import Codes, descriptor_sizes
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model
+
+__all__ = ["PBNS"]
+
+
+@dataclass(frozen=True)
+class PBNS:
+    """An encoder of the pose and the decoder. See `methods.shared.Method`.
+
+    Source: Bertiche, Madadi, Escalera 2021, with the descriptors, sizes and decoder of the other methods here.
+    """
+
+    static: StaticEncoder
+    decoder: Decoder
+    learn_weights: bool = False
+    state = 0
+    controlled = False
+
+    @property
+    def code(self) -> int:
+        """How many numbers a code has."""
+        return self.static.sizes[-1]
+
+    def init(self, keys: tuple[Array, Array], model: Model) -> dict:
+        """Fresh parameters of the encoder."""
+        return {"static": self.static.init(keys[0], jnp.zeros(descriptor_sizes(model)[0], model.basis.dtype))["params"]}
+
+    def loss(self, terms: Terms) -> Terms:
+        """All but inertia, and friction, which knows of a frame before."""
+        return replace(terms, inertia=False, friction=False)
+
+    def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
+        """The code of the frame's pose; nothing is carried."""
+        return state, self._of(params, static)
+
+    def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
+        """Of every frame by itself."""
+        return self._of(params, track.static)
+
+    def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
+        """Of the last frames, time leading; a window begins at its motion's start at the earliest."""
+        back = ends[None] - jnp.arange(last - 1, -1, -1, dtype=ends.dtype)[:, None]
+        return self._of(params, track.static[jnp.maximum(back, track.start[ends][None])])
+
+    def _of(self, params, descriptors):
+        return Codes(jnp.asarray(self.static.apply({"params": params["static"]}, descriptors)))

@@ -1,0 +1,228 @@
+"""Neural cloth simulation whose dynamic code is of a swing: how the garment's own soft vibrations answer to the motion.
+
+The swing q is what implicit Euler makes of the energy linearised about the static garment s_t that the network gives, along
+the directions D of `vibration.softest`, carried by skinning, P_t = R_t D:
+
+    (G_t (1 + c h) + h^2 E_0) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
+
+It begins at zero, rings with the garment's own periods, and decays; nothing of it is learned. What is learned is how the cloth
+goes along with a swing, by the static energy alone:
+
+    x = skin(rest + decoder(z_S + alpha z_D(q)) + alpha D q)
+
+As no past enters that, any pose is trained with any swing, and every step is a descent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.energies.terms import Terms
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.network.decoder import Decoder
+from ncs_jax.network.encoders import StaticEncoder, SwingEncoder
+from ncs_jax.network.methods.method import Codes, decode, descriptor_sizes, garment_blend
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model
+
+__all__ = ["Swing"]
+
+BLOCK = 32  # frames whose statics are posed together
+FEW = 8  # poses of which sums are faster as a product of matrices: ten times of one, but half as fast of 32
+QUIET = 0.02  # of a track's largest swing: a smaller one is not enlarged that far
+
+
+@dataclass(frozen=True)
+class Swing:
+    """The three networks, the dynamic one of the swing. See `methods.shared.Method`.
+
+    verts, modes: how many vertices and vibrations the garment has. damping: c, 1/s. Source: none; the slides' codes that add,
+    with modal dynamics (Pentland and Williams 1989) in place of a recurrent network.
+    """
+
+    static: StaticEncoder
+    dynamic: SwingEncoder
+    decoder: Decoder
+    verts: int
+    modes: int
+    damping: float
+    learn_weights: bool = False
+    controlled = True
+
+    @property
+    def code(self) -> int:
+        """How many numbers a code has."""
+        return self.static.sizes[-1]
+
+    @property
+    def state(self) -> int:
+        """The garment in the two frames before, measured from the root, the root, the swing, and whether there was a frame."""
+        return 6 * self.verts + 3 + self.modes + 1
+
+    def init(self, keys: tuple[Array, Array], model: Model) -> dict:
+        """Fresh parameters of both encoders."""
+        static, swing = jnp.zeros(descriptor_sizes(model)[0], model.basis.dtype), jnp.zeros(self.modes, model.basis.dtype)
+        return {
+            "static": self.static.init(keys[0], static)["params"],
+            "dynamic": self.dynamic.init(keys[1], swing)["params"],
+        }
+
+    def loss(self, terms: Terms) -> Terms:
+        """All but inertia, which is the swing's, and friction, which knows of a frame before."""
+        return replace(terms, inertia=False, friction=False)
+
+    def step(
+        self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array
+    ) -> tuple[Array, Codes]:
+        """z_S of the frame, the swing and its z_D. What is carried knows of no alpha."""
+        shape, fixed = state.shape[:-1], self._static(params, static)
+        state, matrices = state.reshape(-1, self.state).T, jnp.moveaxis(matrices.reshape(-1, *matrices.shape[-3:]), 0, -1)
+        earlier, root, q, started = jnp.split(state, np.cumsum([6 * self.verts, 3, self.modes]))
+        now = matrices[0, :, 3]
+        s, p = self._static_garment(params, model, fixed.reshape(-1, self.code), matrices.at[:, :, 3].add(-now[None]))
+        previous, before = jnp.where(started[None, None] > 0, earlier.reshape(2, *s.shape) + (root - now)[None, None], s[None])
+        g, push = _product(model, p, p), _push(model, p, s - 2 * previous + before)
+        h = 1 / model.fps
+        q = _times(_inverse(self._stiff(model, g)), self.damping * h * _times(g, q) - push)
+        x = s + jnp.sum(p * q[None, None], axis=2)
+        new = jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in (x, previous, now, q, jnp.ones_like(started))])
+        q = q.T.reshape(*shape, self.modes)
+        return new.T.reshape(*shape, self.state), Codes(fixed, self._dynamic(params, q), q)
+
+    def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
+        """Of every frame, without a swing at its motion's start."""
+        q = self.swings(params, model, track)
+        return Codes(self._static(params, track.static), self._dynamic(params, q), q)
+
+    def swings(self, params: dict, model: Model, track: MotionFeatures) -> Float[Array, "frames modes"]:
+        """q of every frame of motions end to end: sums over the garment `BLOCK` frames at a time, then the recurrence."""
+        frames, h = len(track.start), 1 / model.fps
+        z, number = self._static(params, track.static), jnp.arange(frames, dtype=track.start.dtype)
+        block = min(BLOCK, frames)
+        # A block with the two frames before it, of which those before a motion's start are that start.
+        seen = np.clip(np.arange(0, frames, block)[:, None] + np.arange(-2, block), 0, frames - 1)
+
+        def sums(args):
+            z, matrices, number, start = args
+            s, p = self._static_garment(params, model, z, jnp.moveaxis(matrices, 0, -1))
+            (s, s1, s2), (p, p1, p2) = ([a[..., 2 - k : block + 2 - k] for k in range(3)] for a in (s, p))
+            one, two = ((number[2:] - k >= start[2:])[None, None] for k in (1, 2))
+            s1, s2 = jnp.where(one, s1, s), jnp.where(two, s2, jnp.where(one, s1, s))
+            p1, p2 = jnp.where(one[None], p1, 0), jnp.where(two[None], p2, 0)
+            found = _product(model, p, p), _product(model, p, p1), _product(model, p, p2), _push(model, p, s - 2 * s1 + s2)
+            *products, push = found
+            inverse = _inverse(self._stiff(model, products[0]))
+            return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (inverse, *products, push))
+
+        some = lax.map(sums, (z[seen], track.matrices[seen], number[seen], track.start[seen]))
+        inverse, g, g1, g2, push = (a.reshape(-1, *a.shape[2:])[:frames] for a in some)
+
+        def step(swing, frame):
+            previous, before = swing
+            inverse, g, g1, g2, push, begins = frame
+            previous, before = jnp.where(begins, 0, previous), jnp.where(begins, 0, before)
+            q = inverse @ (self.damping * h * (g @ previous) + 2 * (g1 @ previous) - g2 @ before - push)
+            return (q, previous), q
+
+        zero = jnp.zeros(self.modes, push.dtype)
+        return lax.scan(step, (zero, zero), (inverse, g, g1, g2, push, number == track.start), unroll=4)[1]
+
+    def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
+        """Of the last frames, time leading, whose swings the track knows."""
+        back = jnp.maximum(ends[None] - jnp.arange(last - 1, -1, -1, dtype=ends.dtype)[:, None], track.start[ends][None])
+        q = track.swing[back]
+        return Codes(self._static(params, track.static[back]), self._dynamic(params, q), q)
+
+    def mixed(
+        self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], others: Int[Array, "batch"], share
+    ) -> Codes:
+        """Of frames with the swings of other frames, so much of them."""
+        q = share[:, None] * track.swing[others]
+        return Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
+
+    def enlargement(self, track: MotionFeatures, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
+        """By how much the swings q of frames, enlarged, have the energy E_0 |q|^2 / 2 of the track's largest.
+
+        Most of a motion is quiet: so its poses are trained with swings as strong as any of the track's.
+        """
+        size = jnp.linalg.norm(track.swing, axis=1)
+        largest = jnp.max(size)
+        return largest / jnp.maximum(jnp.maximum(size[frames], QUIET * largest), jnp.finfo(size.dtype).tiny)
+
+    def hold(
+        self, model: Model, moved: Float[Array, "verts 3 batch"], swing: Float[Array, "batch modes"]
+    ) -> tuple[Float[Array, "batch"], Array]:
+        """The inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
+
+            sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i,   g_i = d_i^T M d_i
+
+        It is how inertia changes as the garment moves by r beyond q along the vibrations, for the q that implicit Euler gives.
+        Only what the linearised energy does not know of moves it then: the body, above all.
+
+        Args:
+            moved: y, what the dynamic code adds to the offsets, m.
+        """
+        d, mass = model.vibrations.directions, _mass(model)
+        along = (d * mass[:, None, None]).reshape(-1, self.modes)
+        g = jnp.sum(along * d.reshape(along.shape), axis=0)
+        along = along / g[None]
+        r = along.T @ moved.reshape(len(along), -1)
+        inertia, force = (g * model.fps**2)[:, None] * r, model.vibrations.energy * swing.T
+        return jnp.sum(r * (inertia / 2 - force), axis=0), (along @ (inertia - force)).reshape(moved.shape)
+
+    def _static_garment(self, params, model, z, matrices):
+        """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
+        blended = blend(matrices, garment_blend(self, params, model))
+        offsets = decode(self, params, model, z)
+        directions = model.vibrations.directions
+        p = sum(blended[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
+        return skin(blended, model.garment.mesh.rest[..., None] + offsets), p
+
+    def _stiff(self, model, g):
+        """G (1 + c h) + h^2 E_0, poses last."""
+        h = 1 / model.fps
+        return g * (1 + self.damping * h) + h * h * model.vibrations.energy * jnp.eye(self.modes, dtype=g.dtype)[..., None]
+
+    def _static(self, params, descriptors):
+        return jnp.asarray(self.static.apply({"params": params["static"]}, descriptors))
+
+    def _dynamic(self, params, swing):
+        return jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, swing))
+
+
+def _mass(model: Model) -> Float[Array, "verts"]:
+    return model.material.density * model.garment.mesh.vertex_area
+
+
+def _push(model, p, y):
+    """P^T M y (modes, poses)."""
+    return jnp.sum(p * (_mass(model)[:, None, None] * y)[:, :, None], axis=(0, 1))
+
+
+def _product(model, p, q):
+    """P^T M Q (modes, modes, poses)."""
+    weighted = _mass(model)[:, None, None, None] * p
+    if p.shape[-1] < FEW:
+        return jnp.einsum("vikp,vilp->klp", weighted, q)
+    return jnp.stack([jnp.sum(weighted[:, :, k, None] * q, axis=(0, 1)) for k in range(p.shape[2])])
+
+
+def _times(matrix, x):
+    """A x, poses last."""
+    return jnp.sum(matrix * x[None], axis=1)
+
+
+def _inverse(a: Float[Array, "n n poses"]) -> Float[Array, "n n poses"]:
+    """Of positive definite matrices, poses last, by Gauss and Jordan's elimination."""
+    n = len(a)
+    rows = jnp.concatenate([a, jnp.broadcast_to(jnp.eye(n, dtype=a.dtype)[..., None], a.shape)], axis=1)
+    for k in range(n):
+        pivot = rows[k] / rows[k, k][None]
+        rows = (rows - rows[:, k, None] * pivot[None]).at[k].set(pivot)
+    return rows[:, n:]

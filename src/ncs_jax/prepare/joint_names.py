@@ -1,0 +1,157 @@
+"""What a joint is by its name: CMU's, MakeHuman's, Poser's, SMPL's, Mixamo's, Blender's, Unreal's and Biped's conventions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+__all__ = ["Limbs", "anatomy", "pair"]
+
+PREFIX = re.compile(
+    r"^(mixamorig\d*[_\-. :]*|(j[_ ]?bip([_ ]c(?=[_ ]))?|bip\d+|def|org|valvebiped|cc[_ ]base|[mf][_ ]avg)[_\-. :]+)", re.I
+)
+PART = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+HIPS = ("pelvis", "hips", "hip", "spinebase", "root")  # the first that is there
+WORDS = {
+    "clavicle": ("collar", "collarbone", "clavicle", "innershoulder", "shouldergirdle"),
+    "arm": ("arm", "upperarm", "uparm", "shldr"),
+    "forearm": ("forearm", "lowerarm", "lowarm", "elbow"),
+    "hand": ("wrist",),
+    "hip joint": ("hipjoint", "buttock"),
+    "thigh": ("upleg", "upperleg", "thigh"),
+    "shin": ("shin", "knee", "calf", "lowerleg", "lowleg"),
+    "foot": ("ankle",),
+    "toe": ("toe", "toes", "toebase", "ball", "toe0"),
+}
+ROLES = {word: role for role, words in WORDS.items() for word in words}
+# What these are depends on what else the side has: without it the first, with it the second.
+EITHER = {
+    "shoulder": ("arm", "arm", "clavicle"),
+    "hip": ("thigh", "thigh", "hip joint"),
+    "leg": ("shin", "shin", "thigh"),
+    "hand": ("hand", "hand", "palm"),
+    "foot": ("foot", "foot", "toe"),
+}
+FINGER = re.compile(r"(?:hand)?(thumb|index|middle|mid|ring|pinky|little|finger)(\d*)")
+SAME_FINGER = {"mid": "middle", "little": "pinky", "finger": "index"}  # MakeHuman's one finger is a BVH's index finger
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """The joints of a skeleton by what they are.
+
+    roles: joint of each role, as "hips", "head", "left forearm"; of what has no role, of its plain name. spine: from above the
+    hips to the joint that carries the arms. neck: from there to below the head.
+    """
+
+    roles: dict[str, int]
+    spine: tuple[int, ...]
+    neck: tuple[int, ...]
+
+
+def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
+    """Find out what the joints are: limbs by their names; spine and neck, whatever they are called, by what hangs on them.
+
+    Case, separators and prefixes of a rig do not matter. A shoulder, hip, hand or foot is one thing or another by what else
+    its side has: SMPL's shoulder bends the upper arm, Mixamo's carries it.
+
+    Args:
+        names: of the joints. parents: their parents, before them, -1 at the root.
+    """
+    plain = [_plain(name) for name in names]
+    roles: dict[str, int] = {}
+    for j, (side, word) in enumerate(plain):
+        beside = {w for s, w in plain if s == side} if side else set()
+        roles.setdefault(f"{side} {_role(word, beside)}".strip(), j)
+    above = [_path(j, parents) for j in range(len(names))]
+
+    def meet(*words: str) -> int | None:
+        """The joint farthest from the root that carries a role of both sides."""
+        for word in words:
+            if f"left {word}" in roles and f"right {word}" in roles:
+                both = [j for j in above[roles[f"left {word}"]] if j in above[roles[f"right {word}"]]]
+                return max(both, key=lambda j: len(above[j]), default=None)
+        return None
+
+    legs, chest, head = meet("hip joint", "thigh"), meet("clavicle", "arm"), roles.get("head")
+    hips = next((roles[w] for w in HIPS if w in roles), legs if legs is not None else 0)
+    if head is None:  # the last of the necks, or of what else goes on above the chest in the middle
+        rises = [j for word, j in roles.items() if word.startswith("neck")]
+        if not rises and chest is not None:
+            rises = [j for j in range(len(names)) if chest in above[j][1:] and not any(plain[i][0] for i in above[j])]
+        head = max(rises, key=lambda j: len(above[j]), default=None)
+        roles |= {} if head is None else {"head": head}
+    if chest is None and head is not None:
+        carried = [j for j in above[head] if not plain[j][1].startswith(("neck", "head"))]
+        chest = carried[0] if carried else None
+    spine = _between(hips, chest, above)
+    neck = _between(chest if chest is not None else hips, head, above)[:-1]
+    trunk = {hips, *spine, *neck}
+    roles = {word: j for word, j in roles.items() if j not in trunk} | {"hips": hips}
+    return Limbs(roles, spine, neck)
+
+
+def pair(source: Limbs, target: Limbs) -> dict[int, int]:
+    """The joint of the source that drives each joint of the target: of equal role; along spine and neck, evenly spread.
+
+    The last joint of the longer spine is the last of the shorter, as the arms hang on it; a lone one is the lowest.
+    """
+    pairs = {j: source.roles[word] for word, j in target.roles.items() if word in source.roles}
+    for here, there in ((source.spine, target.spine), (source.neck, target.neck)):
+        count = min(len(here), len(there))
+        for i in range(count):
+            pairs[there[_spread(i, count, len(there), 0)]] = here[_spread(i, count, len(here), len(here) - 1)]
+    return dict(sorted(pairs.items()))
+
+
+def _spread(i: int, count: int, length: int, lone: int) -> int:
+    return lone if count == 1 else round(i * (length - 1) / (count - 1))
+
+
+def _plain(name: str) -> tuple[str, str]:
+    """Side ("left", "right" or "") and the rest of a name, in small letters and without separators."""
+    parts = [p.lower() for p in PART.findall(PREFIX.sub("", re.split(r"[:|]", name)[-1]))]
+    parts = [str(int(p)) if p.isdigit() else p for p in parts]
+    for side in ("left", "right"):
+        for mark in (side, side[0]):
+            if mark in parts:
+                parts.remove(mark)
+                return side, "".join(parts)
+    word = "".join(parts)
+    for side in ("left", "right"):
+        if word.startswith(side) or word.endswith(side):
+            return side, word.removeprefix(side).removesuffix(side)
+        if word[:1] == side[0] and (word[1:] in ROLES or word[1:] in EITHER or FINGER.fullmatch(word[1:])):
+            return side, word[1:]
+    return "", word
+
+
+def _role(word: str, beside: set[str]) -> str:
+    """The role of a plain word, given the plain words of its side; the word itself where it has none."""
+    if found := FINGER.fullmatch(word):
+        finger = "thumb" if word.endswith("finger0") else SAME_FINGER.get(found[1], found[1])
+        return f"{finger} {found[2] if found[2] not in ('', '0') else 1}"
+    word = word.removesuffix("1") if word not in ROLES and word.removesuffix("1") in {*ROLES, *EITHER} else word
+    if word not in EITHER or not beside:
+        return ROLES.get(word, word)
+    alone, rival, then = EITHER[word]
+    known = {ROLES.get(w.removesuffix("1")) for w in beside if w != word}
+    if word == "leg":  # a thigh only where something else is the shin
+        return then if "shin" in known and "thigh" not in known else alone
+    return then if rival in known else alone
+
+
+def _path(j: int, parents: Sequence[int]) -> list[int]:
+    """A joint and all above it, itself first."""
+    path = [j]
+    while parents[path[-1]] >= 0:
+        path.append(int(parents[path[-1]]))
+    return path
+
+
+def _between(low: int, high: int | None, above: list[list[int]]) -> tuple[int, ...]:
+    """Joints above `low`, up to and with `high`; none where `high` does not hang on `low`."""
+    if high is None or low not in above[high]:
+        return ()
+    return tuple(reversed(above[high][: above[high].index(low)]))

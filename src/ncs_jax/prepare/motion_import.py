@@ -1,0 +1,183 @@
+"""A motion as read becomes one of a scene's body: frames chosen, turned upright, its joints reordered, or retargeted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+from ncs_jax.geometry.rotations import resample
+from ncs_jax.io import BodyRecord, MotionRecord, read_body
+from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.retarget import body_names, retarget, turned, upright_turn, with_skeleton
+from ncs_jax.scene.spec import MotionSpec, Scene, packaged
+
+__all__ = ["lead", "load_motion", "mirror_partners", "retarget_to_body"]
+
+LEAP = 3.0  # times the fastest turn of nearly all frames: what begins with more leaves a pose that is not part of the motion
+
+
+def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: MotionSpec, world: str = "y") -> MotionRecord:
+    """The same motion of the body's joints, in m, its `notes` saying what was done.
+
+    A skeleton of its own that is not the body's, or other joints, are retargeted (`retarget.retarget`), and what leads in
+    (`lead`) is left out unless the scene chooses frames. SMPL's motions of 22, 24, 52 and 55 joints drive each other's bodies
+    joint by joint, as they are, and so do motions of as many joints as the body has, in the order of the names.
+
+    Args:
+        motion: as read. body: none for a garment without one. spec: says up, scale and joints. world: the axis that points up.
+
+    Raises:
+        InputError: the motion's joints are not the body's and nothing says which is which.
+    """
+    notes: tuple[str, ...] = ()
+    joints = 1 if body is None else len(body.parents)
+    own = motion.joints is not None
+    if own and not spec.frames and (first := lead(motion)):
+        motion = replace(motion, poses=motion.poses[first:], translation=motion.translation[first:])
+        which = "frame 0, a pose from which it leaps, is" if first == 1 else f"frames 0 to {first - 1}, which leap into it, are"
+        notes = (f"{which} left out; motion.frames = [0] keeps all",)
+    names = () if body is None else body_names(body)
+    told = set(spec.joints) & set(motion.joint_names or smpl_names(motion.poses.shape[1]))
+    if body is not None and (told or not _direct(motion, body, names)):
+        short = None if told else _smpl(motion, body)
+        if short is None:
+            up = "" if spec.up == "auto" else spec.up
+            found = retarget(
+                with_skeleton(_of_package(motion), joints), body, joints=spec.joints, scale=spec.scale, up=up, world=world
+            ).motion
+            return replace(found, notes=notes + found.notes)
+        motion, notes = short, (*notes, *short.notes)
+    if motion.poses.shape[1] != joints:
+        raise InputError(
+            f"{joints} joints expected, as the body has", field="poses", value=f"{motion.poses.shape[1]} joints",
+            mend="give a motion of this skeleton",
+        )  # fmt: skip
+    poses, translation, axes = motion.poses, motion.translation, motion.rest_rotations
+    if names and motion.joint_names and motion.joint_names != names and set(motion.joint_names) == set(names):
+        order = [motion.joint_names.index(n) for n in names]
+        poses, axes = poses[:, order], None if axes is None else axes[order]
+    if axes is not None:
+        change = axes if body is None or body.rest_rotations is None else np.swapaxes(body.rest_rotations, 1, 2) @ axes
+        if np.abs(change - np.eye(3)).max() > 1e-4:  # the same joints, whose own axes are others
+            poses = np.einsum("jab,tjb->tja", change, poses)
+    if spec.scale:
+        translation = translation * spec.scale
+        notes = (*notes, f"a unit of its path is {spec.scale:.4g} m, as the scene says")
+    turn = upright_turn((motion.up or world) if spec.up == "auto" else spec.up, world)
+    if turned(turn):
+        axes = np.eye(3) if body is None or body.rest_rotations is None else body.rest_rotations[0]  # the root's own
+        root = axes.T @ turn @ axes @ Rotation.from_rotvec(poses[:, 0]).as_matrix()
+        poses = poses.copy()
+        poses[:, 0] = Rotation.from_matrix(root).as_rotvec()
+        home = np.zeros(3) if body is None else body.joints[0].astype(np.float64)
+        translation = (home + translation) @ turn.T - home
+        notes = (*notes, *turned(turn))
+    return MotionRecord(poses, translation, motion.fps, names, notes=notes)
+
+
+def lead(motion: MotionRecord) -> int:
+    """How many first frames only lead in: a pose, as the T-pose of many .bvh files, and the leap from it into the motion.
+
+    They end where the fastest joint turns no more from one frame to the next than it does in 19 of 20 frames; there are none
+    unless its first turn is `LEAP` times that, nor in motions of fewer than 20 frames.
+    """
+    frames, joints = motion.poses.shape[:2]
+    if frames < 20:
+        return 0
+    turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3))
+    own = np.arange(frames * joints)
+    angle = (turns[own[:-joints]].inv() * turns[own[joints:]]).magnitude().reshape(-1, joints).max(axis=1)
+    usual = np.percentile(angle, 95)
+    return int(np.argmax(angle <= usual)) if angle[0] > LEAP * usual else 0
+
+
+def _direct(motion: MotionRecord, body: BodyRecord, names: tuple[str, ...]) -> bool:
+    """Whether the motion's joints are the body's, in their order or by their names, with the same rest pose if it says."""
+    if motion.poses.shape[1] != len(body.parents):
+        return False
+    order = list(range(len(body.parents)))
+    if names and motion.joint_names:
+        if set(names) != set(motion.joint_names):
+            return False
+        order = [motion.joint_names.index(n) for n in names]
+    if motion.joints is None or not (names and motion.joint_names):
+        return True
+    ours, theirs = body.joints - body.joints[0], (motion.joints - motion.joints[0])[order]
+    return bool(np.abs(ours - theirs).max() < 0.01 * np.abs(ours).max())
+
+
+def _smpl(motion: MotionRecord, body: BodyRecord) -> MotionRecord | None:
+    """A motion of SMPL's joints for a body of SMPL's with another number of them; None where either is not."""
+    theirs, ours = smpl_names(motion.poses.shape[1]), smpl_names(len(body.parents))
+    if not theirs or not ours or motion.joints is not None or motion.joint_names not in ((), theirs):
+        return None
+    if not np.array_equal(body.parents, smpl_parents(len(ours))):
+        return None
+    poses = np.zeros((len(motion.poses), len(ours), 3), motion.poses.dtype)
+    shared = [n for n in ours if n in theirs]
+    poses[:, [ours.index(n) for n in shared]] = motion.poses[:, [theirs.index(n) for n in shared]]
+    still = [n for n in ours if n not in theirs]
+    notes = [f"{len(theirs)} joints of the SMPL family drive {len(shared)} of the body's {len(ours)}"]
+    notes += [f"at rest, as nothing drives them: {', '.join(still)}"] if still else []
+    return replace(motion, poses=poses, joint_names=(), notes=tuple(notes))
+
+
+def _of_package(motion: MotionRecord) -> MotionRecord:
+    """With the skeleton of the packaged body, where it has none and its joints are called so."""
+    if motion.joints is None and motion.joint_names:
+        body = read_body(packaged("body"))
+        if motion.joint_names == body.joint_names:
+            return replace(motion, joints=body.joints, parents=body.parents)
+    return motion
+
+
+def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
+    """A motion at the scene's frame rate, of the body's joints, see `casting.cast`."""
+    path, spec = scene.path(name), scene.motion
+    chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
+    gravity = np.array(scene.physics.gravity)
+    try:
+        record = retarget_to_body(
+            io.read_motion(path, frame_range=chosen), body, spec, "z" if np.abs(gravity).argmax() == 2 else "y"
+        )
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise InputError(error.expected, file=path, field=error.field, value=error.value, mend=error.mend) from None
+    speed = np.abs(np.diff(record.translation, axis=0)).max(initial=0) * record.fps
+    if speed > 100:
+        raise InputError(
+            "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
+            mend="divide centimetres by 100, or say motion.scale = 0.01",
+        )  # fmt: skip
+    poses, translation = record.poses, record.translation
+    if record.fps != scene.motion.fps:
+        begin = translation[:1].astype(np.float64)
+        poses, moved = resample(
+            jnp.asarray(poses, jnp.float32), jnp.asarray(translation - begin, jnp.float32), float(record.fps), scene.motion.fps
+        )
+        translation = begin + np.asarray(moved)
+    return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=scene.motion.fps)
+
+
+def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
+    """The joint on the other side of each joint: by names (left/right, L_/R_), else by mirrored rest positions (x to -x)."""
+    if names:
+        lower = [n.lower() for n in names]
+        place = {n: i for i, n in enumerate(lower)}
+
+        def other(n):
+            for a, b in (("left", "right"), ("l_", "r_"), ("lthumb", "rthumb"), ("lhip", "rhip")):
+                for x, y in ((a, b), (b, a)):
+                    if n.startswith(x) or (len(x) > 2 and x in n):
+                        return n.replace(x, y, 1)
+            return n
+
+        return np.array([place.get(other(n), i) for i, n in enumerate(lower)])
+    mirrored = joints * [-1, 1, 1]
+    return np.linalg.norm(joints[None] - mirrored[:, None], axis=-1).argmin(axis=1)

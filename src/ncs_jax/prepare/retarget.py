@@ -1,0 +1,358 @@
+"""A motion of one skeleton drives a body of another: joints paired by name, bones aligned at rest, paths scaled by the legs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ncs_jax.errors import InputError
+from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
+
+__all__ = ["Retargeted", "body_names", "retarget", "turned", "upright_turn", "with_skeleton"]
+
+# The bones that are aligned at rest, from the trunk outward: the role at either end.
+LIMBS = {"arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+LEG = 0.5, 1.1  # m from hip to ankle of a grown person, to tell units apart
+SAMPLES = 2000  # frames, at least, in which the soles are looked at
+
+# SMPL's joints of a person of 1.7 m in T-pose, facing +Z, the left at +X, by the segment lengths of Drillis and Contini (1966):
+# for motions that come without a skeleton. Fingers, jaw and eyes are where they hang.
+PERSON = {
+    "pelvis": (0, 0.95, 0), "hip": (0.09, 0.9, 0), "knee": (0.09, 0.484, 0), "ankle": (0.09, 0.066, 0), "foot": (0.09, 0, 0.13),
+    "spine1": (0, 1.06, 0), "spine2": (0, 1.17, 0), "spine3": (0, 1.28, 0), "neck": (0, 1.45, 0), "head": (0, 1.52, 0),
+    "collar": (0.06, 1.38, 0), "shoulder": (0.2, 1.39, 0), "elbow": (0.516, 1.39, 0), "wrist": (0.764, 1.39, 0),
+    "hand": (0.85, 1.39, 0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Retargeted:
+    """A motion that drives a body, and how it came about.
+
+    motion: of the body's joints, its translation in m. pairs: the motion's joint of each body joint that is driven. still: body
+    joints that stay at rest. unused: joints of the motion that drive nothing. scale: m for each unit of the motion's lengths.
+    """
+
+    motion: MotionRecord
+    pairs: dict[str, str]
+    still: tuple[str, ...]
+    unused: tuple[str, ...]
+    scale: float
+
+
+def body_names(body: BodyRecord) -> tuple[str, ...]:
+    """The joints' names: the body's own, or SMPL's where it has none and its joints hang together as SMPL's do."""
+    if body.joint_names:
+        return body.joint_names
+    names = smpl_names(len(body.parents))
+    return names if names and np.array_equal(body.parents, smpl_parents(len(names))) else ()
+
+
+def with_skeleton(motion: MotionRecord, wanted: int) -> MotionRecord:
+    """The same with names and rest joints: its own, or without any those of a person in SMPL's T-pose, where it is SMPL's.
+
+    Raises:
+        InputError: it has no skeleton, and is not of SMPL's joints; nor of the `wanted` ones of the body.
+    """
+    if motion.joints is not None and motion.joint_names:
+        return motion
+    count = motion.poses.shape[1]
+    names = smpl_names(count)
+    if not names or (motion.joint_names and motion.joint_names != names):
+        called = f", called {', '.join(motion.joint_names[:3])}" if motion.joint_names else ""
+        raise InputError(
+            f"the body's {wanted} joints expected, or names and a skeleton to retarget by", field="poses",
+            value=f"{count} joints{called}", mend="write joint_names (J,), joints (J, 3) and parents (J,), or give a .bvh",
+        )  # fmt: skip
+    parents = smpl_parents(count)
+    joints = np.zeros((count, 3))
+    for j, name in enumerate(names):
+        side, _, part = name.rpartition("_")
+        place = PERSON.get(part)
+        joints[j] = joints[parents[j]] if place is None else np.array(place) * ((-1 if side == "right" else 1), 1, 1)
+    return replace(motion, joint_names=names, joints=joints, parents=parents)
+
+
+def retarget(
+    motion: MotionRecord,
+    body: BodyRecord,
+    *,
+    joints: Mapping[str, str] | None = None,
+    scale: float = 0.0,
+    up: str = "",
+    world: str = "y",
+) -> Retargeted:
+    """Drive a body by a motion of another skeleton.
+
+    Joints are paired by name, see `joint_names`; a body joint without a partner stays at rest, and what the motion's joints
+    between two paired ones turn is part of the next. With R_s the world rotation of a joint of the source since its rest,
+
+        R_t = U R_s A,
+
+    A takes the body's rest to the source's: of the trunk, the quarter turns between their axes; of upper arm, forearm, thigh
+    and shin, besides, the least rotation that lays the one bone at rest along the other, so that its direction is the source's
+    in every frame; of a foot, a turn about the vertical only, as both stand on the ground, unless the two point 45 degrees
+    apart. U turns the source's up to the world's. The path of the hips is scaled by the ratio of the legs, hip to ankle, and
+    moved up or down so that the lowest sole (but for a twentieth of the frames) is as high as the soles are at rest.
+
+    Args:
+        motion: with names and skeleton, see `with_skeleton`; lengths in any unit. body: with names, or SMPL's joints.
+        joints: the body's joint, by name or number, for a joint of the motion, "" for none, in place of what the names say.
+        scale: m for each unit of the motion's lengths; 0: by the legs. up: axis of the motion's world, "y" or "z"; "": the
+            motion's own, else z where its skeleton stands along z, at rest and moving. world: the axis that points up here.
+
+    Raises:
+        InputError: no names, names that do not match, or overrides that name no joint of the body.
+    """
+    names = body_names(body)
+    if not names:
+        raise InputError(
+            "a body with joint names expected, as the motion has another skeleton", field="joint_names", value="none",
+            mend="write joint_names (J,) into the body's file",
+        )  # fmt: skip
+    source, target = anatomy(motion.joint_names, motion.parents.tolist()), anatomy(names, body.parents.tolist())
+    joints = joints or {}
+    foreign = [n for n in joints if n not in motion.joint_names]
+    lost = [f"joints that motion.joints names and this motion has not: {', '.join(foreign)}"] if foreign else []
+    pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
+    source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
+    hips_s, hips_t = source.roles["hips"], target.roles["hips"]
+    if hips_t not in pairs or len(pairs) < min(3, len(names)):
+        raise InputError(
+            "joint names that say what they are expected", field="joint_names", value=list(motion.joint_names),
+            mend=f"pair them with the body's by motion.joints in the scene file; the body has {', '.join(names)}",
+        )  # fmt: skip
+    turns, places = _forward(motion)
+    axes = _axes(body.joints, target)
+    quarter = _axes(motion.joints, source) @ axes.T
+    upright = upright_turn(up or motion.up or _standing(places, motion.joints, source), world)
+    align = _alignment(motion, body, source, target, pairs, quarter, axes)
+
+    frames, count = len(turns), len(names)
+    world_turns = np.zeros((frames, count, 3, 3))
+    local = np.zeros((frames, count, 3))
+    for j, parent in enumerate(body.parents):
+        above = world_turns[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (frames, 3, 3))
+        world_turns[:, j] = upright @ turns[:, pairs[j]] @ align[j] if j in pairs else above
+        if j in pairs:  # of the others exactly zero: a joint that never turns tells the network nothing
+            own = np.swapaxes(above, 1, 2) @ world_turns[:, j]
+            if body.rest_rotations is not None:
+                own = body.rest_rotations[j].T @ own @ body.rest_rotations[j]
+            local[:, j] = Rotation.from_matrix(own).as_rotvec()
+            if np.ptp(local[:, j], axis=0).max() < 1e-7:
+                local[:, j] = np.where(np.abs(local[0, j]) < 1e-7, 0, local[0, j])
+
+    by = "as the scene says" if scale else "by the legs" if _leg(source, motion.joints) > 0 else "by the trunk"
+    scale = scale or _leg_ratio(motion, body, source, target)
+    home = body.joints[hips_t] - scale * quarter.T @ motion.joints[hips_s]
+    path = home + scale * places[:, hips_s] @ upright.T
+    bodily = replace(motion, poses=local, translation=np.zeros((frames, 3)), joints=body.joints, parents=body.parents)
+    offsets = _forward(bodily, world_turns)[1]  # with the root at its rest place
+    translation = path - offsets[:, hips_t]
+    axis = "xyz".index(world)
+    soles = _soles(body, target, world_turns, offsets + translation[:, None], axis, axes[:, 1])
+    low = np.percentile(soles, 5)
+    translation[:, axis] -= low
+    driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
+    moved = MotionRecord(local, translation, motion.fps, names)
+    result = Retargeted(
+        moved, driven, tuple(n for n in names if n not in driven),
+        tuple(n for n in motion.joint_names if n not in set(driven.values())), scale,
+    )  # fmt: skip
+    notes = (*_notes(result, motion, source, by, float(soles.max() - low)), *lost, *turned(upright))
+    return replace(result, motion=replace(moved, notes=notes))
+
+
+def upright_turn(up: str, world: str) -> np.ndarray:
+    """The quarter turn about x that takes one axis that points up to another: from Z up to Y up, (x, y, z) to (x, z, -y)."""
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return np.eye(3) if up == world else turn if world == "y" else turn.T
+
+
+def turned(turn: np.ndarray) -> tuple[str, ...]:
+    """That turn in words; none where nothing turns."""
+    return () if turn[1, 1] else ("turned from Z up to Y up" if turn[1, 2] > 0 else "turned from Y up to Z up",)
+
+
+QUARTERS = [
+    np.array(signs)[:, None] * np.eye(3)[list(order)]
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))
+    for signs in product((1, -1), repeat=3)
+]
+QUARTERS = [q for q in QUARTERS if np.linalg.det(q) > 0]  # the 24 rotations of a cube, the identity first
+
+
+def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[str, ...], joints: Mapping[str, str]) -> dict:
+    """The pairs with what the user says of joints of this motion; a joint drives what he says and nothing else."""
+    for theirs, ours in joints.items():
+        number = target.index(ours) if ours in target else int(ours) if ours.isdigit() else -1
+        if ours and not 0 <= number < len(target):
+            raise InputError(
+                "a joint of the body expected", field=f"motion.joints.{theirs}", value=ours, mend=f"it has {', '.join(target)}"
+            )
+        if theirs in source:
+            pairs = {j: i for j, i in pairs.items() if i != source.index(theirs) and j != number}
+            pairs |= {number: source.index(theirs)} if ours else {}
+    return dict(sorted(pairs.items()))
+
+
+def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """World rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
+    known = turns is not None
+    if turns is None:
+        turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix()
+        turns = turns.reshape(*motion.poses.shape, 3)
+        if motion.rest_rotations is not None:
+            turns = motion.rest_rotations @ turns @ np.swapaxes(motion.rest_rotations, 1, 2)
+    places = np.zeros(motion.poses.shape)
+    for j, parent in enumerate(motion.parents):
+        if parent < 0:
+            places[:, j] = motion.joints[j] + motion.translation
+            continue
+        if not known:
+            turns[:, j] = turns[:, parent] @ turns[:, j]
+        places[:, j] = places[:, parent] + turns[:, parent] @ (motion.joints[j] - motion.joints[parent]).astype(np.float64)
+    return turns, places
+
+
+def _axes(joints: np.ndarray, of: Limbs) -> np.ndarray:
+    """Columns that point left, up and forward of a skeleton at rest, along the axes of coordinates that are nearest."""
+    sides = [
+        joints[of.roles[f"left {r}"]] - joints[of.roles[f"right {r}"]]
+        for r in ("thigh", "arm")
+        if f"left {r}" in of.roles and f"right {r}" in of.roles
+    ]
+    left = np.sum(sides, axis=0) if sides else np.zeros(3)
+    up = joints[_top(of)] - joints[of.roles["hips"]]
+    forward = np.cross(left, up)
+    if not np.linalg.norm(forward) > 0:  # no two sides, or no height
+        return np.eye(3)
+    left, forward = left / np.linalg.norm(left), forward / np.linalg.norm(forward)
+    found = np.stack([left, np.cross(forward, left), forward], axis=1)
+    return min(QUARTERS, key=lambda q: -np.trace(q.T @ found))
+
+
+def _top(of: Limbs) -> int:
+    return of.roles["head"] if "head" in of.roles else (of.neck or of.spine or (of.roles["hips"],))[-1]
+
+
+def _standing(places: np.ndarray, joints: np.ndarray, of: Limbs) -> str:
+    """The axis of the world that points up: z where hips to head are along it both at rest and on average, else y."""
+    rest = joints[_top(of)] - joints[of.roles["hips"]]
+    mean = (places[:, _top(of)] - places[:, of.roles["hips"]]).mean(axis=0)
+    return "z" if all(d[2] > 2 * np.abs(d[:2]).max() for d in (rest, mean)) else "y"
+
+
+def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The least rotation that takes direction a to b; of opposite ones, half a turn about an axis in the frontal plane."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis, cosine = np.cross(a, b), a @ b
+    if cosine < -1 + 1e-9:
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int], quarter, axes) -> np.ndarray:
+    """A of each body joint (J, 3, 3), from its rest to that of its partner."""
+    role = {j: word for word, j in target.roles.items()}
+    align = np.broadcast_to(quarter, (len(body.parents), 3, 3)).copy()
+    for j, parent in enumerate(body.parents):
+        side, _, part = role.get(j, "").partition(" ")
+        if parent >= 0:
+            align[j] = align[parent]
+        if j not in pairs or part not in {*LIMBS, "foot"}:
+            continue
+        end = f"{side} {LIMBS.get(part, 'toe')}"
+        ours, theirs = _bone(target, end, body.joints, None, j), _bone(source, end, motion.joints, motion.tips, pairs[j])
+        if part == "foot":
+            align[j] = quarter
+            if ours is not None and theirs is not None:
+                align[j] = quarter @ axes @ _foot(axes.T @ ours, axes.T @ quarter.T @ theirs) @ axes.T
+        elif ours is not None and theirs is not None:
+            align[j] = _least_turn(align[j] @ ours, theirs) @ align[j]
+    return align
+
+
+def _bone(of: Limbs, end: str, joints, tips, j: int) -> np.ndarray | None:
+    """From a joint to where its bone ends: the joint of that role, or the tip; None where nothing says."""
+    place = joints[of.roles[end]] if of.roles.get(end, j) != j else joints[j] if tips is None else tips[j]
+    bone = (place - joints[j]).astype(np.float64)
+    return bone if np.linalg.norm(bone) > 0 else None
+
+
+def _foot(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """From the direction of the body's foot at rest to the source's, both as left, up and forward."""
+    flat, other = ours * (1, 0, 1), theirs * (1, 0, 1)
+    if np.linalg.norm(other) < 0.2 * np.linalg.norm(theirs) or np.linalg.norm(flat) == 0:
+        return np.eye(3)  # straight down: it ends in the sole, and says nothing of where the toes are
+    turn = _least_turn(flat, other)
+    apart = _least_turn(turn @ ours, theirs)
+    return apart @ turn if np.trace(apart) < 1 + 2 * np.cos(np.pi / 4) else turn
+
+
+def _leg(of: Limbs, joints: np.ndarray) -> float:
+    """Hip to ankle along the bones, the mean of both sides; NaN without legs."""
+    lengths = []
+    for side in ("left", "right"):
+        chain = [of.roles.get(f"{side} {part}") for part in ("thigh", "shin", "foot")]
+        if None not in chain:
+            lengths.append(np.linalg.norm(np.diff(joints[chain], axis=0), axis=1).sum())
+    return float(np.mean(lengths)) if lengths else float("nan")
+
+
+def _leg_ratio(motion: MotionRecord, body: BodyRecord, source: Limbs, target: Limbs) -> float:
+    """Metres on the body for each unit of the source: by the legs, else by the trunk from hips to head."""
+    ours, theirs = _leg(target, body.joints), _leg(source, motion.joints)
+    if not (np.isfinite(ours) and theirs > 0):
+        ours, theirs = (
+            float(np.linalg.norm(x[_top(a)] - x[a.roles["hips"]]))
+            for x, a in ((body.joints, target), (motion.joints, source))
+        )  # fmt: skip
+    if not (ours > 0 and theirs > 0):
+        raise InputError("legs or a trunk to tell the unit by expected", field="motion.scale", value=0, mend="give the scale")
+    return ours / theirs
+
+
+def _soles(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarray, axis: int, up) -> np.ndarray:
+    """How high (m) the lowest sole is in a frame over where soles are at rest, along the body's `up`; of some, if many."""
+    every = slice(None, None, 1 + len(turns) // SAMPLES)
+    feet = {target.roles[f"{side} foot"] for side in ("left", "right") if f"{side} foot" in target.roles}
+    for j, parent in enumerate(body.parents):
+        feet |= {j} if parent in feet else set()
+    soles = np.flatnonzero(body.weights[:, sorted(feet)].sum(axis=1) > 0.5)
+    if not len(soles):
+        low = sorted(feet) or slice(None)
+        return places[every, low, axis].min(axis=1) - (body.joints[low] @ up).min()
+    points, heights = body.vertices[soles].astype(np.float64), np.zeros((len(turns[every]), len(soles)))
+    for j in np.flatnonzero(body.weights[soles].max(axis=0) > 0).tolist():
+        own = turns[every, j, axis] @ (points - body.joints[j]).T + places[every, j, axis, None]
+        heights += own * body.weights[soles, j]
+    return heights.min(axis=1) - (points @ up).min()
+
+
+def _notes(result: Retargeted, motion: MotionRecord, source: Limbs, by: str, rise: float) -> tuple[str, ...]:
+    """What was done, in words."""
+    count = len(result.pairs) + len(result.still)
+    pairs = [o if o == t else f"{o} by {t}" for o, t in result.pairs.items()]
+    notes = [f"retargeted by joint names, {len(pairs)} of the body's {count} joints are driven: {', '.join(pairs)}"]
+    if result.still:
+        notes.append(f"at rest, as nothing drives them: {', '.join(result.still)}")
+    if result.unused:
+        notes.append(f"joints of the motion that drive nothing: {', '.join(result.unused)}")
+    leg = _leg(source, motion.joints)
+    unit = min(UNITS, key=lambda u: abs(np.log(leg * UNITS[u] / 0.8))) if leg > 0 else "m"
+    like = LEG[0] < leg * UNITS[unit] < LEG[1]
+    told = f" (it seems to be in {unit})" if like and unit != "m" else ""
+    legs = f", {by}; hip to ankle is {leg:.4g} units{told}" if leg > 0 else f", {by}"
+    notes.append(f"a unit of its lengths is {result.scale:.4g} m here{legs}")
+    notes.append(f"its lowest sole is where soles are at rest; in other frames the lower foot is up to {rise:.2f} m higher")
+    return tuple(notes)

@@ -1,0 +1,164 @@
+"""How near a scene is to where things break: what `ncs check` says beside what is in it.
+
+The ranges are those of the stability map (`experiments/stability.py`): inside, float32 agrees with float64 to a thousandth and
+nothing fails; outside, a scene is at risk. What cannot work at all is refused when it is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.energies.contact.distance import triangle_distance
+from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.geometry.mesh import LINE
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.io import MotionRecord
+from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.scene.model import Model, local_rotations, pose_body
+from ncs_jax.scene.spec import Scene
+
+__all__ = ["RANGES", "Finding", "findings"]
+
+# quantity: (least, most) that is safe
+RANGES = {
+    "time step": (1 / 240, 1 / 5),  # s
+    "time step of a recurrence": (1 / 15, 1 / 5),
+    "density": (0.01, 10.0),  # kg/m^2
+    "stiffness": (1e-3, 1e4),  # times the default
+    "gravity": (0.0, 100 * 9.81),  # m/s^2
+    "size": (0.01, 100.0),  # m
+    "way": (0.0, 1000.0),  # m from where a motion begins
+    "height of a triangle": (1e-3, 1.0),  # of its longest edge
+}
+DEEP = 0.01  # m inside the body, where the body alone carries the garment,
+MANY = 0.02  # that so many of its vertices may be
+LEAP = 0.3  # m within a frame, which is a limb's thickness
+TURN = 90.0  # degrees within a frame
+POSES = 8  # of every motion that are looked at
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What puts a scene at risk: the quantity, what it is here, what may happen, and the mend."""
+
+    what: str
+    value: str
+    risk: str
+    mend: str
+
+
+def _outside(name: str, value: float, shown: str, risk: str, mend: str) -> Iterator[Finding]:
+    low, high = RANGES[name]
+    if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6):
+        yield Finding(name, f"{shown} (safe: {low:.4g} to {high:.4g})", risk, mend)
+
+
+def _material(scene: Scene) -> Iterator[Finding]:
+    physics, default, fps = scene.physics, Scene().physics, scene.motion.fps
+    rounding = "forces of very different size are added in single precision"
+    yield from _outside(
+        "time step", 1 / fps, f"1/{fps:g} s", "the energy of inertia is far from that of the cloth", "motion.fps from 5 to 240"
+    )
+    if scene.network.method == "ncs" and scene.network.cell != "swing" and physics.inertia:
+        yield from _outside(
+            "time step of a recurrence", 1 / fps, f"1/{fps:g} s", "inertia against its own past feeds on itself",
+            'network.cell = "swing", or motion.fps up to 15: what it learned may be used at any frame rate',
+        )  # fmt: skip
+    yield from _outside("density", physics.density, f"{physics.density:g} kg/m^2", rounding, "physics.density")
+    pull = float(np.linalg.norm(physics.gravity))
+    yield from _outside("gravity", pull, f"{pull:g} m/s^2", rounding, "physics.gravity")
+    names = {"stvk": ("lam", "mu"), "neo_hookean": ("lam", "mu"), "baraff_witkin": ("stretch", "shear"), "none": ()}
+    pairs = {
+        f"physics.membrane.{n}": (getattr(physics.membrane, n), getattr(default.membrane, n))
+        for n in names.get(physics.membrane.model, ("stiffness",))
+    }
+    for term in ("bending", "collision", "pinning"):
+        pairs[f"physics.{term}.stiffness"] = getattr(physics, term).stiffness, getattr(default, term).stiffness
+    for field, (value, usual) in pairs.items():
+        if value > 0:
+            yield from _outside("stiffness", value / usual, f"{value / usual:.3g} times the default", rounding, field)
+
+
+def _mesh(a: Assembly) -> Iterator[Finding]:
+    x, faces = np.asarray(a.garment.vertices, np.float64), np.asarray(a.garment.faces)
+    size = float(np.ptp(x, axis=0).max())
+    yield from _outside("size", size, f"{size:.3g} m", "thicknesses and stiffnesses are of another scale", "scale it to metres")
+    edges = np.linalg.norm(x[faces] - x[np.roll(faces, 1, axis=1)], axis=-1)
+    double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=-1)
+    longest = edges.max(axis=1)
+    slim = double / np.where(longest > 0, longest, 1) ** 2
+    clean = "clean the mesh where it was made"
+    flat = int((slim <= LINE).sum())
+    if flat:
+        yield Finding("triangles of no area", str(flat), "they weigh nothing and resist nothing", clean)
+    worst = float(slim[slim > LINE].min(initial=1.0))
+    count = int((slim[slim > LINE] < RANGES["height of a triangle"][0]).sum())
+    shown = f"{worst:.1e} of its longest edge, {count} such"
+    yield from _outside("height of a triangle", worst, shown, "its strain is rounding", clean)
+    twice = len(x) - len(np.unique(x, axis=0))
+    if twice:
+        yield Finding("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
+
+
+@jax.jit
+def _depths(model: Model, matrices):
+    """Signed distances to the body of the garment as the body alone carries it, frame by frame, m."""
+
+    def depth(matrices):
+        x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
+        index, _ = nearest_triangle(x, body, model.surface)
+        return triangle_distance(x, body, model.surface, index)
+
+    return jax.lax.map(depth, matrices)
+
+
+def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Finding]:
+    still = [MotionRecord(pose[None], np.zeros((1, 3), poses.dtype), model.fps) for pose in poses]
+    depth = -np.asarray(_depths(model, features_from_records(model, *still).matrices))
+    share = float((depth > deep).mean(axis=1).max())
+    if share > many:
+        value = f"{100 * share:.1f} % of its vertices by more than {1000 * deep:.0f} mm, up to {1000 * depth.max():.1f} mm"
+        yield Finding(f"garment inside the body {when}", value, "contact pushes out on whichever side is nearer", mend)
+
+
+def _motion(a: Assembly, name: str) -> Iterator[Finding]:
+    from scipy.spatial.transform import Rotation
+
+    record, model = a.motions[name], a.model
+    way = record.translation.astype(np.float64)
+    far = float(np.linalg.norm(way - way[:1], axis=1).max())
+    yield from _outside("way", far, f"{far:.0f} m in {name}", "positions are rounded to more than 0.1 mm", "cut the motion")
+    leap = np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0)
+    if leap > LEAP:
+        value = f"{leap:.2f} m in {name}, frame {1 + int(np.linalg.norm(np.diff(way, axis=0), axis=1).argmax())}"
+        yield Finding("leap within a frame", value, "cloth is left behind and torn after", "cut the motion there")
+    local = np.asarray(local_rotations(model, jnp.asarray(record.poses, model.basis.dtype)))
+    if len(local) > 1:
+        steps = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
+        turn = np.degrees(Rotation.from_matrix(steps.reshape(-1, 3, 3)).magnitude()).reshape(steps.shape[:2])
+        if turn.max() > TURN:
+            frame, joint = np.unravel_index(turn.argmax(), turn.shape)
+            number = model.source_joints[joint]
+            label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
+            value = f"{turn.max():.0f} degrees in {name}, frame {frame + 1}, joint {label}"
+            yield Finding("turn within a frame", value, "a limb passes through cloth", "clean the motion there")
+    if model.surface is not None:
+        frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
+        mend = "mend the pose, or smooth the skinning weights"
+        yield from _inside(model, record.poses[frames], f"where the body alone carries it in {name}", DEEP, MANY, mend)
+
+
+def findings(a: Assembly) -> list[Finding]:
+    """All that puts a scene at risk, from its material, its mesh, its fit and its motions; none where it is safe."""
+    found = [*_material(a.scene), *_mesh(a)]
+    if a.model.surface is not None:
+        joints = 1 if a.body is None else len(a.body.parents)
+        found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out: ncs fit")
+    for name in a.motions:
+        found += _motion(a, name)
+    return found

@@ -1,0 +1,52 @@
+"""Skinning weights of a garment from those of the body, and which joints they use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.energies.contact.distance import closest_weights
+from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.surface import surface_from
+
+__all__ = ["smooth_weights", "transfer_weights", "used_joints"]
+
+
+def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Skinning weights (verts, joints) of each garment vertex, interpolated at the nearest point of the body's **surface**."""
+    surface = surface_from(garment, body, faces)
+
+    @jax.jit
+    def nearest(x, body, surface):
+        index, _ = nearest_triangle(x, body, surface)
+        return index, closest_weights(x, body[surface.faces[index]])
+
+    x, points = jnp.asarray(garment, jnp.float32), jnp.asarray(body, jnp.float32)
+    index, barycentric = nearest(x, points, surface)
+    return np.einsum("vk,vkj->vj", np.asarray(barycentric, np.float64), np.asarray(weights)[faces[np.asarray(index)]])
+
+
+def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.ndarray:
+    """Replace each vertex's weights by the mean of its neighbours', `times` times over."""
+    from scipy.sparse import coo_matrix, diags
+
+    verts = len(weights)
+    i, j = np.concatenate([edges, edges[:, ::-1]]).T
+    neighbours = coo_matrix((np.ones(len(i)), (i, j)), shape=(verts, verts)).tocsr()
+    degree = np.asarray(neighbours.sum(axis=1)).ravel()
+    mean = diags(1 / np.maximum(degree, 1)) @ neighbours + diags((degree == 0).astype(float))
+    for _ in range(times):
+        weights = mean @ weights
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def used_joints(parents: Sequence[int], weights: np.ndarray, least: float = 0.01) -> tuple[int, ...]:
+    """The joints whose weight reaches `least` on some vertex of (verts, joints), with all their ancestors, in order."""
+    wanted = set(np.flatnonzero(np.asarray(weights).max(axis=0, initial=0) >= least).tolist())
+    for j in list(wanted):
+        while (j := int(parents[j])) >= 0:
+            wanted.add(j)
+    return tuple(sorted(wanted | {list(parents).index(-1)}))

@@ -1,0 +1,135 @@
+"""The part of the body that a garment can touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.energies.contact.surface import Surface, surface_from
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Blend, Skeleton, blend, blend_from, forward, skin, transforms
+from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.surface import boundary_loops
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Layer, Model, pose_body
+
+__all__ = ["covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+
+
+def touchable(
+    skeleton: Skeleton,
+    garment: np.ndarray,
+    garment_blend: Blend,
+    body: np.ndarray,
+    body_blend: Blend,
+    rotations: Sequence[np.ndarray],
+    reach: float,
+) -> np.ndarray:
+    """Which body vertices come within `reach` (m) of the skinned rest garment in any of the given poses; (body,) bool.
+
+    `rotations` are local ones, (joints, 3, 3) each; the rest pose is always looked at.
+    """
+    from scipy.spatial import cKDTree
+
+    @jax.jit
+    def posed(local):
+        m = transforms(skeleton, forward(skeleton, local, jnp.zeros(3, local.dtype)))
+        return skin(blend(m, garment_blend), jnp.asarray(garment, local.dtype)), skin(
+            blend(m, body_blend), jnp.asarray(body, local.dtype)
+        )
+
+    near = np.zeros(len(body), bool)
+    rest = np.broadcast_to(np.eye(3), (len(skeleton.parents), 3, 3))
+    dtype = skeleton.joints.dtype
+    for local in [rest, *rotations]:
+        cloth, skin_ = posed(jnp.asarray(local, dtype))
+        distance, _ = cKDTree(np.asarray(cloth)).query(np.asarray(skin_), distance_upper_bound=reach)
+        near |= np.isfinite(distance)
+    return near
+
+
+COVER = 0.06  # m from the skin within which a garment below covers it,
+RIM = 0.1  # m from its rim at least
+
+
+def touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.ndarray:
+    """Triangles of the part of the body and of the garments below, which face outward as the body does."""
+    from scipy.spatial import cKDTree
+
+    faces, count = [_submesh(body.faces, part, len(body.vertices))], len(part)
+    for layer in model.under:
+        own, rest = np.asarray(layer.model.garment.mesh.faces), np.asarray(layer.rest)
+        _, near = cKDTree(body.vertices).query(rest)
+        outward = np.sum(vertex_normals(rest, own) * vertex_normals(body.vertices, body.faces)[near])
+        faces.append(count + (own if outward >= 0 else own[:, ::-1]))
+        count += len(rest)
+    return np.concatenate(faces)
+
+
+def covered_by_layers(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarray:
+    """Which body vertices (body,) a garment below lies over: the nearest point of it is in front of them and not at its rim.
+
+    They are no part of what the garment above touches, as there is cloth between; with them, it would be held off by the skin
+    where it is through the cloth.
+    """
+    from scipy.spatial import cKDTree
+
+    hidden, normals = np.zeros(len(body.vertices), bool), vertex_normals(body.vertices, body.faces)
+    for layer in under:
+        rest, faces = np.asarray(layer.rest), np.asarray(layer.model.garment.mesh.faces)
+        away, near = cKDTree(rest).query(body.vertices)
+        gap = rest[near] - body.vertices
+        rim = rest[np.concatenate([*boundary_loops(faces), np.zeros(0, int)]).astype(int)]
+        inner = np.ones(len(body.vertices), bool) if not len(rim) else cKDTree(rim).query(body.vertices)[0] > RIM
+        hidden |= (away < COVER) & inner & (np.sum(gap * normals, axis=1) > 0.5 * away)
+    return hidden
+
+
+def surface_of(model: Model, faces, track: MotionFeatures | None, smooth: bool, samples: int = 8) -> Surface:
+    """The touchable body, its search prepared for what comes near what in a few poses of the motion."""
+
+    def posed(matrices):
+        return skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
+
+    poses = []
+    if track is not None:
+        frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
+        poses = list(zip(*map(np.asarray, jax.jit(jax.vmap(posed))(track.matrices[frames])), strict=True))
+    rest, body = np.asarray(model.garment.mesh.rest), np.concatenate([model.body, *(layer.rest for layer in model.under)])
+    return surface_from(rest, body, faces, smooth=smooth, posed=poses)
+
+
+def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
+    """Return the numbers of the body vertices that the garment can touch in the scene's motions."""
+    if scene.body.part == "all":
+        return np.arange(len(body.vertices))
+    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
+    poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(body.parents), 3), np.float32)
+    looked = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
+    local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(looked)))
+    if body.rest_rotations is not None:
+        local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
+    # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
+    corners = body.vertices[body.faces]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
+    near = touchable(
+        skeleton,
+        garment.vertices,
+        blend_from(weights),
+        body.vertices,
+        blend_from(body.weights),
+        list(local),
+        scene.physics.collision.reach + edge / np.sqrt(3),
+    )
+    return np.unique(body.faces[near[body.faces].any(axis=1)])
+
+
+def _submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:
+    place = np.full(verts, -1)
+    place[kept] = np.arange(len(kept))
+    inside = place[faces]
+    return inside[(inside >= 0).all(axis=1)]

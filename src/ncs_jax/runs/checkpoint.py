@@ -1,0 +1,159 @@
+"""Run folders: Orbax checkpoints, and the JSON that rebuilds everything else.
+
+    RUN/run.json                the scene, the steps planned, the seed, the versions
+    RUN/prepared.npz            what was found out from the scene's files: skinning weights, touchable part, modes
+    RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
+    RUN/log.csv                 one row a report
+
+Every write goes to a temporary name first and is renamed when complete, so a kill at any moment leaves the last good one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.tables.npz import read_npz
+from ncs_jax.prepare.build import Prepared
+
+__all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
+
+
+def check_writable(run: Path) -> None:
+    """See, before anything is worked out, that a run folder can be made.
+
+    Raises:
+        InputError: it cannot.
+    """
+    there = next(p for p in (run, *run.absolute().parents) if p.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        kind = "is not a folder" if not there.is_dir() else "may not be written to"
+        raise InputError(f"a folder that can be written expected: {there} {kind}", file=run, mend="choose another --out")
+
+
+def write_run(run: Path, facts: dict) -> None:
+    """Write RUN/run.json atomically.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        temporary = run / "run.json.part"
+        temporary.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        os.replace(temporary, run / "run.json")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"a folder that can be written expected: {reason}", file=run, mend="choose another --out") from None
+
+
+def read_run(run: Path) -> dict:
+    """Read RUN/run.json.
+
+    Raises:
+        InputError: the folder is not a run.
+    """
+    path = Path(run) / "run.json"
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no run there", file=path, mend="give a folder that ncs train made") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"not a run file: {error}", file=path, mend="train again into a new folder") from None
+    if not isinstance(facts, dict) or "scene" not in facts or "steps" not in facts:
+        raise InputError("not a run file", file=path, field="scene", mend="train again into a new folder")
+    return facts
+
+
+def write_prepared(run: Path, prepared: Prepared) -> None:
+    """Write RUN/prepared.npz atomically."""
+    temporary = run / "prepared.part.npz"
+    np.savez_compressed(temporary, **vars(prepared))
+    os.replace(temporary, run / "prepared.npz")
+
+
+def read_prepared(run: Path) -> Prepared:
+    """Read RUN/prepared.npz.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    fields = dataclasses.fields(Prepared)
+    names = [f.name for f in fields]
+    path = Path(run) / "prepared.npz"
+    try:
+        table = read_npz(path, names.__contains__)
+        first = [f.name for f in fields if f.default_factory is dataclasses.MISSING]  # of a run of an earlier version
+        return Prepared(**{name: table.array(name) for name in names if name in table or name in first})
+    except InputError as error:
+        raise InputError(error.expected, file=path, field=error.field, mend="train again into a new folder") from None
+
+
+class Checkpoints:
+    """The checkpoints of one run. Orbax writes each into a temporary folder and renames it when it is whole."""
+
+    def __init__(self, run: Path):
+        import orbax.checkpoint as ocp
+
+        here = jax.process_index()  # whichever process this is, it waits for no other
+        alone = ocp.options.MultiprocessingOptions(here, active_processes={here}, barrier_sync_key_prefix=f"process {here}")
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True, create=False,
+            multiprocessing_options=alone,
+        )  # fmt: skip
+        self._folder = (Path(run) / "checkpoints").absolute()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._manager = ocp.CheckpointManager(self._folder, options=options)
+        self._args = ocp.args
+
+    def save(self, step: int, state: Any) -> None:
+        """Write the state after `step` steps.
+
+        Raises:
+            InputError: the disk is full, or the folder is gone.
+        """
+        try:
+            # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
+            self._manager.save(step, args=self._args.StandardSave(jax.tree.map(np.asarray, state)))
+            self._manager.wait_until_finished()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            mend = "make room and go on with --resume; the checkpoint before this one is whole"
+            raise InputError(
+                f"the checkpoint of step {step} cannot be written: {reason}", file=self._folder, mend=mend
+            ) from None
+
+    def latest(self) -> int | None:
+        """The newest whole checkpoint's step."""
+        return self._manager.latest_step()
+
+    def restore(self, like: Any) -> Any:
+        """The newest state, with the shapes and types of `like`.
+
+        Raises:
+            InputError: it is damaged, or of another network.
+        """
+        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), like)
+        step = self.latest()
+        # Where one array is damaged, the others, still being read, complain one by one that nobody waits for them.
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        try:
+            state = self._manager.restore(step, args=self._args.StandardRestore(shapes))
+        except Exception as error:  # Orbax and its store have no common error class
+            reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            mend = "delete this folder to go back to the checkpoint before it"
+            raise InputError(f"the checkpoint cannot be read: {reason}", file=self._folder / str(step), mend=mend) from error
+        sys.unraisablehook = hook
+        return jax.device_put(state)
+
+    def close(self) -> None:
+        """Wait for pending writes."""
+        self._manager.close()

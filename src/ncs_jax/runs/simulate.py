@@ -1,0 +1,206 @@
+"""Simulate a scene's garment over a motion, frame by frame, with progress and resumption."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.spatial.transform import Rotation
+
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import energies
+from ncs_jax.errors import InputError
+from ncs_jax.geometry.skinning import skin
+from ncs_jax.io.tables.npz import read_npz, write_npz
+from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import Model
+from ncs_jax.scene.spec import Scene, load_scene
+from ncs_jax.simulation.implicit_euler import SimulationState, Simulator, simulator_from, stepper
+from ncs_jax.simulation.solver.minimise import STANDARD_GRAVITY, Settings, Solution
+
+__all__ = ["Progress", "Trajectory", "simulate"]
+
+SAVE_EVERY = 10.0  # s
+TURN = (0.3, 0.5, 0.7)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a simulation says after every frame."""
+
+    frame: int
+    frames: int
+    iterations: int
+    residual: float  # g
+    status: int
+    left: float  # s
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A simulated garment: vertices (frames, verts, 3) in m, and of every frame how its solve went, see `Solution`.
+
+    With substeps, `iterations` is their sum, and `residual` and `status` are the worst of them. `seconds` is the wall-clock
+    time of a frame; that of the first one of a run includes compiling.
+    """
+
+    vertices: np.ndarray
+    iterations: np.ndarray
+    residual: np.ndarray  # g
+    status: np.ndarray
+    seconds: np.ndarray
+    fps: float
+    assembly: Assembly
+
+
+@jax.jit
+def _turned(model: Model, turn) -> Array:
+    """The gradient, N, of stretch, bending and pins of a garment that is only turned: rounding and nothing else."""
+    garment, rest = model.garment, model.garment.mesh.rest
+    blended = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
+    terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False)
+
+    def energy(x):
+        return sum(
+            energies(x, garment, model.material, StepInputs(blended=blended), terms).values(), start=jnp.zeros((), x.dtype)
+        )
+
+    return jax.grad(energy)(skin(blended, rest))
+
+
+def rounding(model: Model) -> float:
+    """About what rounding leaves out of balance in the precision of a model, as a `Solution`'s residual, in g.
+
+    Positions are rounded to a share of their distance from the root, and cloth that is stiff for its weight answers with
+    accelerations: here their mass-weighted r.m.s. where the garment is only turned, and nothing strains. Of what a simulation
+    cannot go below it is 0.9 to 3.3 times as much (`experiments.stability`).
+    """
+    turn = jnp.asarray(Rotation.from_rotvec(TURN).as_matrix(), model.basis.dtype)
+    gradient = np.asarray(_turned(model, turn), np.float64)
+    mass = np.asarray(model.material.density * model.garment.mesh.vertex_area, np.float64)
+    squares = np.divide((gradient**2).sum(axis=1), mass, out=np.zeros_like(mass), where=mass > 0)
+    return float(np.sqrt(squares.sum() / mass.sum()) / STANDARD_GRAVITY)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _follow(simulator: Simulator, settings: Settings, state: SimulationState, matrices):
+    return stepper(simulator, settings).follow(state, matrices)
+
+
+def simulate(
+    scene: Scene | str | Path,
+    motion: str | None = None,
+    *,
+    partial: str | Path | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> Trajectory:
+    """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
+
+    Args:
+        scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
+            first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
+            after every frame. The vertices are of the precision that was computed in.
+
+    Raises:
+        InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
+    """
+    scene = load_scene(scene) if isinstance(scene, str | Path) else scene
+    named = (*scene.motion.files, *scene.motion.validation)
+    name = motion or (named[0] if named else None)
+    if name is not None and not name.startswith("ncs:") and name not in named:
+        name = str(Path(name).absolute())
+    fine = scene.motion.fps * scene.simulation.substeps
+    # What can be touched is found out from this motion.
+    lone = replace(
+        scene.without_network(),
+        motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False),
+    )
+    precision = scene.simulation.precision
+    if precision != "double":
+        assembly = assemble(lone)
+        if precision == "single" or rounding(assembly.model) <= scene.simulation.tolerance:
+            return _simulated(scene, lone, assembly, name, partial, report)
+    with jax.enable_x64(True):
+        return _simulated(scene, lone, assemble(lone, dtype=jnp.float64), name, partial, report)
+
+
+def _simulated(
+    scene: Scene, lone: Scene, assembly: Assembly, name: str | None, partial: str | Path | None, report
+) -> Trajectory:
+    spec, model = scene.simulation, assembly.model
+    dtype = model.basis.dtype
+    records = [] if name is None else [load_motion(lone, name, assembly.body)]
+    track = features_from_records(model, *records) if records else assembly.track
+    matrices = track.matrices
+    settings = Settings(
+        spec.solver, spec.tolerance, spec.iterations, inertia=scene.physics.inertia, exact_pins=spec.pins == "exact"
+    )
+    simulator = simulator_from(model)
+    state = stepper(simulator, settings).init()
+    frames = 1 + (len(matrices) - 1) // spec.substeps
+    identity = json.dumps([scene.to_dict(), name, frames], sort_keys=True)
+    done: dict[str, np.ndarray] = {
+        "vertices": np.zeros((0, *model.garment.mesh.rest.shape), dtype),
+        "iterations": np.zeros(0, np.int64),
+        "residual": np.zeros(0),
+        "status": np.zeros(0, np.int64),
+        "seconds": np.zeros(0),
+    }
+    if partial is not None and Path(partial).exists():
+        done, state = _continued(Path(partial), identity, done, state)
+    rows: dict[str, list] = {key: list(values) for key, values in done.items()}
+    begun = saved = time.monotonic()
+    first = len(rows["status"])
+    for t in range(first, frames):
+        solutions: list[Solution] = []
+        started = time.monotonic()
+        for k in range((t - 1) * spec.substeps + 1 if t else 0, t * spec.substeps + 1):
+            state, x = _follow(simulator, settings, state, matrices[k])
+            solutions.append(jax.device_get(state.solution))
+        rows["vertices"].append(np.asarray(x))
+        rows["iterations"].append(sum(int(s.iterations) for s in solutions))
+        rows["residual"].append(max(float(s.residual) for s in solutions))
+        rows["status"].append(max(int(s.status) for s in solutions))
+        now = time.monotonic()
+        rows["seconds"].append(now - started)
+        if report is not None:
+            left = (now - begun) / (t + 1 - first) * (frames - 1 - t)
+            report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
+        if partial is not None and now - saved > SAVE_EVERY and t + 1 < frames:
+            arrays = {key: np.asarray(values) for key, values in rows.items()}
+            write_npz(partial, **_kept(state), identity=np.asarray(identity), **arrays)
+            saved = time.monotonic()
+    arrays = {key: np.asarray(values) for key, values in rows.items()}
+    shown = jax.tree.map(lambda a: a[:: spec.substeps], track)
+    arrays["vertices"] = np.asarray(shown.absolute(jnp.asarray(arrays["vertices"])))
+    return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
+
+
+KEPT = ("previous", "before", "unposed", "unposed_before")  # the state, beside how the last solve went
+
+
+def _kept(state: SimulationState) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(state, name)) for name in KEPT}
+
+
+def _continued(partial: Path, identity: str, like: dict[str, np.ndarray], start: SimulationState):
+    """The frames that are done, and the state to go on from."""
+    table = read_npz(partial, {*like, *KEPT, "identity"}.__contains__)
+    if str(table.array("identity")) != identity:
+        raise InputError(
+            "the same scene and motion expected", file=partial, field="identity", value="another simulation's",
+            mend="delete this file to begin anew",
+        )  # fmt: skip
+    done = {key: np.asarray(table.array(key), values.dtype) for key, values in like.items()}
+    previous, before, unposed, unposed_before = (jnp.asarray(table.array(name)) for name in KEPT)
+    return done, SimulationState(previous, before, unposed, unposed_before, jnp.asarray(True), start.solution)

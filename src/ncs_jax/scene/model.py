@@ -1,0 +1,106 @@
+"""Everything about a scene that does not change while it runs: the character, the garment on it, and what they are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.contact.surface import Surface, vertex_normals
+from ncs_jax.energies.terms import Garment, Material, Terms
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
+
+__all__ = ["Model", "RitzModes", "local_rotations", "pose_body", "posed_bodies"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RitzModes:
+    """Movements of a garment about its drape, in unposed space: see `vibration.softest`.
+
+    directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
+    """
+
+    directions: Float[Array, "verts 3 modes"]
+    energy: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Layer:
+    """A garment worn below, which collides as a part of the body: what animates it."""
+
+    model: Model
+    params: dict
+    network: Any = field(metadata={"static": True})
+
+    @property
+    def rest(self) -> Float[Array, "verts 3"]:
+        """Its place at rest, m."""
+        return self.model.garment.mesh.rest
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Model:
+    """Constants of a scene. The skeleton holds only the joints that matter, the `source_joints` of the motion's.
+
+    `inputs` are the joints that the network reads, the root first. `body` and its `surface` are the part of the body that the
+    garment can touch, `None` in a scene without a body or without collision. To the surface also belong the garments `under`
+    this one, after the body: each of their vertices goes by a transform of its own, which a track has after those of the
+    joints.
+    """
+
+    skeleton: Skeleton
+    rest_rotations: Float[Array, "joints 3 3"] | None
+    garment: Garment
+    blend: Blend
+    material: Material
+    basis: Float[Array, "verts modes"]  # smooth modes that the decoder works with, m
+    body: Float[Array, "body 3"] | None
+    body_blend: Blend | None
+    surface: Surface | None
+    terms: Terms = field(metadata={"static": True})
+    inputs: tuple[int, ...] = field(metadata={"static": True})
+    source_joints: tuple[int, ...] = field(metadata={"static": True})
+    descriptor: str = field(metadata={"static": True})
+    fps: float = field(metadata={"static": True})
+    moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
+    vibrations: RitzModes | None = None  # where the network swings along them
+    under: tuple[Layer, ...] = ()  # garments worn below this one
+
+
+def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
+    """The touchable body in one frame or several, and the garments under this one, m."""
+    lanes = (1,) * (matrices.ndim - 3)
+    body = skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + lanes))
+    if not model.under:
+        return body
+    rest = jnp.concatenate([layer.rest for layer in model.under])
+    return jnp.concatenate([body, rest.reshape(rest.shape + lanes) + matrices[len(model.skeleton.parents) :, :, 3]])
+
+
+def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:
+    """Positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
+    frames = len(matrices)
+    at = np.minimum(np.arange(-(-frames // lanes) * lanes), frames - 1).reshape(-1, lanes)
+
+    def some(matrices):
+        body = pose_body(model, jnp.moveaxis(matrices, 0, -1))
+        return jnp.concatenate([body, vertex_normals(body, model.surface)], axis=1)
+
+    blocks = lax.map(some, matrices[at])
+    return jnp.moveaxis(blocks, -1, 1).reshape(-1, *blocks.shape[1:3])[:frames]
+
+
+@jax.jit
+def local_rotations(model: Model, poses: Float[Array, "*frames all 3"]) -> Float[Array, "*frames joints 3 3"]:
+    """Local rotation matrices, along the world's axes at rest, of the joints that matter, from axis-angle poses of all."""
+    local = axis_angle_to_matrix(poses[..., np.asarray(model.source_joints), :])
+    return local if model.rest_rotations is None else to_rest_axes(local, model.rest_rotations)

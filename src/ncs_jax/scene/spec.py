@@ -1,0 +1,396 @@
+"""Scene files: one TOML file that describes body, garment, motion, physics, network and training, checked field by field."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ncs_jax.errors import InputError
+
+__all__ = [
+    "PRESETS",
+    "BendingSpec",
+    "BodySpec",
+    "CollisionSpec",
+    "GarmentSpec",
+    "MembraneSpec",
+    "MotionSpec",
+    "NetworkSpec",
+    "PhysicsSpec",
+    "PinningSpec",
+    "Scene",
+    "SelfContactSpec",
+    "SimulationSpec",
+    "TrainingSpec",
+    "load_scene",
+    "packaged",
+    "scene_from",
+    "template",
+]
+
+ASSETS = Path(__file__).parents[1] / "assets"
+
+
+def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple = (), above: bool = False):
+    """A field with its help text and range; `above` excludes the lower end."""
+    meta = {"help": text, "low": low, "high": high, "choices": choices, "above": above}
+    if isinstance(default, list | dict):
+        return field(default_factory=lambda: default, metadata=meta)
+    if isinstance(default, type):
+        return field(default_factory=default, metadata=meta)
+    return field(default=default, metadata=meta)
+
+
+@dataclass(frozen=True)
+class BodySpec:
+    """[body]: the character."""
+
+    file: str = _f("ncs:body", "body file, ncs:NAME for a packaged one, or 'none' for a garment without a body")
+    joints: tuple[str, ...] = _f((), "names or numbers of the joints that the network reads; empty: those that matter")
+    part: str = _f("auto", "part of the body that the garment can touch", choices=("auto", "all"))
+
+
+@dataclass(frozen=True)
+class GarmentSpec:
+    """[garment]: what it wears."""
+
+    file: str = _f("ncs:tshirt", "garment mesh in its rest shape on the resting body")
+    scale: float = _f(0.0, "metres a unit of the file, 0.01 for cm; 0: as the file says, else 1", low=0, high=1e6)
+    up: str = _f("", "axis that is up in the file; empty: as the file says, else y", choices=("", "x", "y", "z"))
+    weld: float = _f(0.0, "vertices within it of each other become one, m; 0: none", low=0, high=1)
+    smoothing: int = _f(10, "how many times the skinning weights are averaged over the garment", low=0, high=10000)
+    pins: str = _f("", "name of the vertex group that is pinned; empty: none")
+    learn_weights: bool = _f(False, "train the skinning weights too")
+    over: tuple[str, ...] = _f((), "run folders of the garments below it, trained before, which collide as part of the body")
+
+
+@dataclass(frozen=True)
+class MotionSpec:
+    """[motion]: what the character does."""
+
+    files: tuple[str, ...] = _f(("ncs:walk",), "motions to train on; empty: the character stands still in its rest pose")
+    validation: tuple[str, ...] = _f((), "motions that are only looked at")
+    fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
+    mirror: bool = _f(False, "train on the mirror image of every motion too")
+    frames: tuple[int, ...] = _f(
+        (), "first frame, and the one after the last, of every file; empty: all of it", low=0, high=10**9
+    )
+    scale: float = _f(0.0, "m for each unit of a file's lengths; 0: metres, of another skeleton by its legs", low=0, high=1e6)
+    up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"))
+    joints: dict[str, str] = _f({}, 'the body\'s joint for a joint of a motion, where names do not tell; "": none')
+
+
+@dataclass(frozen=True)
+class MembraneSpec:
+    """[physics.membrane]: resistance to stretch and shear."""
+
+    model: str = _f("stvk", "membrane model", choices=("stvk", "neo_hookean", "baraff_witkin", "mass_spring", "none"))
+    lam: float = _f(41.8, "Lame parameter lambda times thickness, N/m (stvk, neo_hookean)", low=0, high=1e9)
+    mu: float = _f(22.2, "Lame parameter mu times thickness, N/m (stvk, neo_hookean)", low=0, high=1e9)
+    stretch: float = _f(40.0, "stretch stiffness, N/m (baraff_witkin)", low=0, high=1e9)
+    shear: float = _f(20.0, "shear stiffness, N/m (baraff_witkin)", low=0, high=1e9)
+    stiffness: float = _f(60.0, "spring stiffness, N/m (mass_spring)", low=0, high=1e9)
+
+
+@dataclass(frozen=True)
+class BendingSpec:
+    """[physics.bending]."""
+
+    stiffness: float = _f(1e-5, "bending stiffness, N m; 0: no bending", low=0, high=1e6)
+
+
+@dataclass(frozen=True)
+class CollisionSpec:
+    """[physics.collision]."""
+
+    stiffness: float = _f(10.0, "k_c, J/m^2 a vertex; 0: no collision", low=0, high=1e9)
+    thickness: float = _f(0.004, "distance to keep from the body, m", low=0, high=0.1)
+    distance: str = _f("plane", "signed distance to the body", choices=("plane", "smooth", "triangle"))
+    search: str = _f("exact", "search for the nearest feature", choices=("exact", "candidates"))
+    friction: float = _f(0.0, "coefficient of friction between garment and body; 0: none", low=0, high=10)
+    reach: float = _f(0.08, "how near to the skinned garment the body can be touched, m", low=0.005, high=10)
+
+
+@dataclass(frozen=True)
+class SelfContactSpec:
+    """[physics.self_contact]."""
+
+    stiffness: float = _f(0.0, "k_s, J/m^2 a pair; 0: cloth passes through cloth", low=0, high=1e9)
+    thickness: float = _f(0.003, "distance of cloth from cloth, m", low=0, high=0.1, above=True)
+
+
+@dataclass(frozen=True)
+class PinningSpec:
+    """[physics.pinning]."""
+
+    stiffness: float = _f(1000.0, "k_p, N/m a pinned vertex", low=0, high=1e9)
+
+
+@dataclass(frozen=True)
+class PhysicsSpec:
+    """[physics]: what the garment is made of, in SI units."""
+
+    gravity: tuple[float, ...] = _f((0.0, -9.81, 0.0), "gravity, m/s^2", low=-1000, high=1000)
+    density: float = _f(0.15, "mass per area, kg/m^2", low=1e-4, high=1e3)
+    inertia: bool = _f(True, "mass resists acceleration")
+    membrane: MembraneSpec = _f(MembraneSpec, "")
+    bending: BendingSpec = _f(BendingSpec, "")
+    collision: CollisionSpec = _f(CollisionSpec, "")
+    pinning: PinningSpec = _f(PinningSpec, "")
+    self_contact: SelfContactSpec = _f(SelfContactSpec, "")
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """[network]: the method, and the sizes of its networks."""
+
+    method: str = _f("ncs", "ncs; pbns, a pose without motion; snug, one recurrent network", choices=("ncs", "pbns", "snug"))
+    descriptor: str = _f("heading_free", "pose descriptor", choices=("heading_free", "six", "quaternion", "axis_angle"))
+    static: tuple[int, ...] = _f((64, 128, 256), "static encoder; snug has the last size", low=1, high=65536)
+    joint: tuple[int, ...] = _f((32, 32), "dynamic encoder, each joint by itself", low=1, high=65536)
+    dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints; snug's encoder", low=1, high=65536)
+    cell: str = _f("gated", "what ncs remembers by, see the README", choices=("gated", "linear", "swing"))
+    vibrations: int = _f(12, "the garment's vibrations that a swing is made of", low=1, high=256)
+    damping: float = _f(0.3, "of a swing, 1/s", low=0, high=1e6)
+    decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
+    modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
+
+
+@dataclass(frozen=True)
+class TrainingSpec:
+    """[training]."""
+
+    steps: int = _f(5000, "optimiser steps", low=1, high=10_000_000)
+    batch: int = _f(32, "windows a step", low=1, high=65536)
+    window: int = _f(11, "frames a window; inertia sees at least 3", low=1, high=10000)
+    learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
+    motion_augmentation: float = _f(0.0, "share of a batch with another window's motion", low=0, high=1)
+    validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)
+    checkpoint_every: int = _f(200, "steps between checkpoints", low=1, high=10_000_000)
+    seed: int = _f(0, "seed of all that is random", low=0, high=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class SimulationSpec:
+    """[simulation]: how `ncs simulate` solves a frame."""
+
+    solver: str = _f("newton", "newton for accuracy, quasi_newton for speed", choices=("newton", "quasi_newton"))
+    tolerance: float = _f(0.1, "out-of-balance acceleration, g", low=1e-9, high=1e6)
+    precision: str = _f("auto", "auto: double where single cannot reach the tolerance", choices=("auto", "single", "double"))
+    iterations: int = _f(100, "most iterations a step", low=1, high=1_000_000)
+    substeps: int = _f(1, "steps a frame", low=1, high=1000)
+    pins: str = _f("springs", "what holds the pins", choices=("springs", "exact"))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A validated scene. `source` is the file it came from; relative paths resolve from its folder."""
+
+    body: BodySpec = _f(BodySpec, "")
+    garment: GarmentSpec = _f(GarmentSpec, "")
+    motion: MotionSpec = _f(MotionSpec, "")
+    physics: PhysicsSpec = _f(PhysicsSpec, "")
+    network: NetworkSpec = _f(NetworkSpec, "")
+    training: TrainingSpec = _f(TrainingSpec, "")
+    simulation: SimulationSpec = _f(SimulationSpec, "")
+    source: str = field(default="", metadata={"internal": True})
+
+    def path(self, name: str) -> Path:
+        """Where a file named in this scene is."""
+        if name.startswith("ncs:"):
+            return packaged(name[4:])
+        path = Path(name).expanduser()
+        return path if path.is_absolute() or not self.source else Path(self.source).parent / path
+
+    @property
+    def motions(self) -> tuple[str, ...]:
+        """All motions by name, those to train on first."""
+        return (*self.motion.files, *self.motion.validation)
+
+    def without_network(self) -> Scene:
+        """The same with nothing that only a network needs, for a simulation or an animation that is there already."""
+        return dataclasses.replace(self, network=dataclasses.replace(self.network, method="pbns", modes=0))
+
+    def to_dict(self) -> dict:
+        """Plain tables, as in the file, with files as absolute paths, so that the scene can be rebuilt anywhere."""
+        tables = dataclasses.asdict(self)
+        del tables["source"]
+
+        def absolute(name):
+            return name if name.startswith("ncs:") or name in ("", "none") else str(self.path(name).resolve())
+
+        tables["body"]["file"] = absolute(tables["body"]["file"])
+        tables["garment"]["file"] = absolute(tables["garment"]["file"])
+        tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
+        for key in ("files", "validation"):
+            tables["motion"][key] = [absolute(name) for name in tables["motion"][key]]
+        return tables
+
+
+PRESETS: dict[str, dict] = {
+    "fast": {
+        "network": {"static": (64, 128, 128), "dynamic": (128, 128), "decoder": (128, 128, 128), "modes": 64},
+        "training": {"steps": 2000},
+    },
+    "balanced": {
+        "network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128},
+        "training": {"steps": 5000},
+    },
+    "accurate": {
+        "network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128},
+        "training": {"steps": 15000},
+    },
+}  # what `ncs train --preset` puts in place of a scene's own values; experiments/speed_accuracy.py measures them
+
+
+def packaged(name: str, suffix: str = ".npz") -> Path:
+    """A file that comes with the package."""
+    path = ASSETS / f"{name}{suffix}"
+    if not path.is_file():
+        known = ", ".join(sorted(f"ncs:{p.stem}" for p in ASSETS.glob(f"*{suffix}")))
+        raise InputError("no such packaged file", field=f"ncs:{name}", mend=f"use one of {known}")
+    return path
+
+
+def load_scene(path: str | Path, preset: str | None = None) -> Scene:
+    """Read and check a scene file; `ncs:NAME` names a packaged scene.
+
+    Args:
+        path: the file. preset: one of PRESETS, whose values take the place of the scene's own.
+
+    Raises:
+        InputError: the file is missing or not TOML, a key is unknown, or a value has the wrong type or is out of its range.
+    """
+    text = str(path)
+    file = packaged(text[4:], ".toml") if text.startswith("ncs:") else Path(path)
+    try:
+        tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such scene file", file=file, mend="check the path, or try ncs:tshirt") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not TOML: {error}", file=file, mend="mend that line") from None
+    for table, values in PRESETS[preset].items() if preset else ():
+        if isinstance(own := tables.get(table, {}), dict):
+            tables[table] = {**own, **values}
+    return scene_from(tables, source=str(file))
+
+
+def scene_from(tables: dict, source: str = "") -> Scene:
+    """A scene from plain tables, checked like a file."""
+    scene = _parse(Scene, tables, source or "scene", "")
+    gravity = scene.physics.gravity
+    if len(gravity) != 3:
+        raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
+    if len(scene.motion.frames) > 2:
+        raise InputError("one or two numbers expected", file=source, field="motion.frames", value=list(scene.motion.frames))
+    for name in ("static", "decoder"):
+        if not getattr(scene.network, name):
+            raise InputError("at least one layer expected", file=source, field=f"network.{name}", value=[])
+    if scene.network.cell == "linear" and scene.network.static[-1] % 2:
+        raise InputError("an even last size expected", file=source, field="network.static", value=list(scene.network.static))
+    if scene.garment.file in ("", "none"):
+        raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
+    return dataclasses.replace(scene, source=source)
+
+
+def template() -> str:
+    """A whole scene file: every field with its default, and in a comment what it is and what it may be."""
+    return "\n".join(_tables(Scene(), "")).strip() + "\n"
+
+
+def _tables(spec, where: str) -> Iterator[str]:
+    """The lines of a table's own fields, then of the tables in it."""
+    fields = [f for f in dataclasses.fields(spec) if not f.metadata.get("internal")]
+    nested = [f for f in fields if dataclasses.is_dataclass(getattr(spec, f.name))]
+    if where:
+        yield f"\n[{where}]"
+    for f in fields:
+        if f not in nested:
+            value, meta = getattr(spec, f.name), f.metadata
+            text = f"{f.name} = {json.dumps(value)}"
+            note = meta["help"]
+            if meta["choices"]:
+                note += ": " + ", ".join(meta["choices"])
+            elif math.isfinite(meta["low"]):
+                note += f"; {'above' if meta['above'] else 'from'} {meta['low']:.10g} to {meta['high']:.10g}"
+            yield f"{text:36} # {note}"
+    for f in nested:
+        yield from _tables(getattr(spec, f.name), f"{where}.{f.name}".lstrip("."))
+
+
+def _parse(cls, tables, source: str, where: str):
+    if not isinstance(tables, dict):
+        raise InputError("a table expected", file=source, field=where, value=tables, mend=f"write [{where}] and its fields")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
+    for key in tables:
+        if key not in fields:
+            near = _nearest(key, fields)
+            raise InputError(
+                "unknown key",
+                file=source,
+                field=f"{where}.{key}".lstrip("."),
+                value=tables[key],
+                mend=f"did you mean {near}?" if near else f"known here: {', '.join(fields)}",
+            )
+    values = {}
+    for name, f in fields.items():
+        if name in tables:
+            values[name] = _value(hints[name], tables[name], f.metadata, source, f"{where}.{name}".lstrip("."))
+    return cls(**values)
+
+
+def _value(kind, value, meta, source, where):
+    if dataclasses.is_dataclass(kind):
+        return _parse(kind, value, source, where)
+    origin = typing.get_origin(kind)
+    if origin in (typing.Union, types.UnionType):
+        kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        return None if value is None else _value(kind, value, meta, source, where)
+    if origin is tuple:
+        if isinstance(value, str | int | float) and not isinstance(value, bool):
+            raise InputError("a list expected", file=source, field=where, value=value, mend=f"write [{value!r}]")
+        if not isinstance(value, list | tuple):
+            raise InputError("a list expected", file=source, field=where, value=value)
+        item = typing.get_args(kind)[0]
+        return tuple(_value(item, v, meta, source, f"{where}[{i}]") for i, v in enumerate(value))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise InputError("a table expected", file=source, field=where, value=value, mend='write { "theirs" = "ours" }')
+        return {k: _value(typing.get_args(kind)[1], v, meta, source, f"{where}.{k}") for k, v in value.items()}
+    if kind is str and isinstance(value, int) and not isinstance(value, bool):
+        value = str(value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    good = {
+        bool: isinstance(value, bool),
+        int: number and float(value).is_integer(),
+        float: number,
+        str: isinstance(value, str),
+    }
+    if not good[kind]:
+        names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+        raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value)
+    if meta["choices"] and value not in meta["choices"]:
+        raise InputError(f"one of {', '.join(meta['choices'])} expected", file=source, field=where, value=value)
+    if kind in (int, float):
+        low, high = meta["low"], meta["high"]
+        if not (low < value <= high if meta["above"] else low <= value <= high):
+            bounds = f"a number {'above' if meta['above'] else 'from'} {low:g} {'up ' if meta['above'] else ''}to {high:g}"
+            raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value)
+    return kind(value)
+
+
+def _nearest(key: str, names) -> str:
+    import difflib
+
+    return next(iter(difflib.get_close_matches(key, list(names), n=1)), "")

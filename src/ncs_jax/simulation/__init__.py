@@ -1,0 +1,3 @@
+"""Full-space simulation: implicit Euler of the energy that trains the network."""
+
+__all__: list[str] = []

@@ -1,0 +1,133 @@
+"""The vibrations of a garment about its drape: what a swing is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.geometry.laplacian_modes import modal_basis
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model, RitzModes, pose_body
+from ncs_jax.simulation.solver.problem import TALL, Problem, blocks, descended, evaluated, imbalance, knowing, look, static_step
+from ncs_jax.simulation.solver.stiffness import couplings_from
+
+__all__ = ["softest_ritz_modes"]
+
+AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
+STEPS = 200  # of Newton's method to the drape
+ENOUGH = {np.dtype(np.float32): 0.3, np.dtype(np.float64): 0.01}  # m/s^2: the acceleration that may be left there
+LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
+
+
+def _still(model: Model, track: MotionFeatures) -> Problem:
+    """The garment in a track's first frame, seen from the root joint, which no past moves."""
+    matrices = track.matrices[0]
+    matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
+    terms = replace(model.terms, inertia=False, friction=False, self_contact=False)
+    blended = blend(matrices, model.blend)
+    body = None if model.surface is None else pose_body(model, matrices)
+    rest = model.garment.mesh.rest
+    nothing = jnp.zeros((), rest.dtype)
+    couplings = couplings_from(model.garment.mesh)
+    return Problem(replace(model, terms=terms), couplings, None, body, blended, rest, None, nothing)
+
+
+@jax.jit
+def _evaluated(problem: Problem, x):
+    """The problem that knows what is near, what is known of the place, and the blocks of its stiffness and a mass."""
+    problem = knowing(problem, look(problem, x))
+    point = evaluated(problem, x)
+    return problem, point, blocks(problem, x, point)
+
+
+@jax.jit
+def _descended(problem: Problem, x, point, p):
+    seen = None if problem.seen is None else (problem.near, problem.pairs, problem.seen)
+    x, *_, moved = descended(problem, seen, x, point, p)
+    return x, moved
+
+
+def _matrix(problem: Problem, diagonal, off):
+    """Of blocks, a sparse matrix (3 verts, 3 verts)."""
+    from scipy.sparse import coo_matrix
+
+    n, pairs = len(diagonal), np.asarray(problem.couplings.pairs)
+    i, j = np.concatenate([np.stack([np.arange(n)] * 2, axis=1), pairs, pairs[:, ::-1]]).T
+    values = np.concatenate([diagonal, off, np.swapaxes(off, 1, 2)])
+    rows, columns = np.broadcast_arrays(3 * i[:, None, None] + np.arange(3)[:, None], 3 * j[:, None, None] + np.arange(3))
+    matrix = coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, 3 * n)).tocsc()
+    return (matrix + matrix.T) / 2
+
+
+def _solved(matrix, right):
+    """The solution of a positive definite system."""
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
+
+
+def _drape(problem: Problem):
+    """The problem and the blocks at the static equilibrium x_0, found by Newton's method from cloth that is skinned.
+
+    What `simulator` does, on the host: that is slower a step, and has no factorisation of its own to compile.
+    """
+    x, mass = skin(problem.blended, problem.model.garment.mesh.rest), jnp.sum(problem.mass)
+    for _ in range(STEPS):
+        near, point, found = _evaluated(problem, x)
+        diagonal, off = (np.asarray(block, np.float64) for block in found)
+        if jnp.sqrt(jnp.sum(imbalance(near, point.gradient)) / mass) < ENOUGH[x.dtype]:
+            break
+        p = _solved(_matrix(problem, diagonal, off), -np.asarray(point.gradient, np.float64).ravel())
+        x, moved = _descended(near, x, point, jnp.asarray(p.reshape(x.shape), x.dtype))
+        if not moved:
+            break
+    return near, diagonal, off
+
+
+def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
+    """The `count` softest vibrations of a garment among those that smooth inertia forces excite.
+
+    Such a force is a mass times a smooth mode b_j (`modes.modal_basis`) along an axis e_i. What it does to the drape x_0, the
+    static equilibrium in the first frame of a track, is a load-dependent Ritz vector u_ij; of those the vibrations are made:
+
+        (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
+
+    K = d^2 E / dx^2 at x_0, as Newton's method has it, holds the tension of the cloth that hangs and what contact presses;
+    without them a garment would have no period of its own. s is `LEAST`'s. R are the blended rotations of skinning there: the
+    directions d_k (m) are those of unposed space. Each is scaled so that it costs the same energy, d^T K d = E_0, the softest
+    having a root mean square of `AMPLITUDE`. The softest vibrations of all would be those of single folds, which nothing
+    excites. Source: Wilson, Yuan and Dickens 1982.
+
+    Returns:
+        None where the garment hangs on nothing: a vibration is slower than `LEAST`.
+    """
+    from scipy.linalg import eigh
+    from scipy.sparse import diags
+
+    problem, diagonal, off = _drape(_still(model, track))
+    mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
+    n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
+    added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
+    stiff, masses = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3)), diags(np.repeat(mass, 3))
+    held = np.asarray(model.garment.pins) if model.terms.pinning else ()
+    rest, area = (np.asarray(a, np.float64) for a in (mesh.rest, mesh.vertex_area))
+    smooth = modal_basis(rest, np.asarray(mesh.faces), area, -(-count // 3), held=held)
+    if not smooth.size:
+        return None
+    least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
+    u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
+    squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
+    if squares[0] < least:
+        return None
+    squares, vectors = squares[:count], (u @ combined)[:, :count]
+    vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(squares))] < 0, -1, 1)
+    energy = AMPLITUDE**2 * mass.sum() * squares[0]
+    directions = np.linalg.solve(
+        np.asarray(problem.blended, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
+    )
+    dtype = model.basis.dtype
+    return RitzModes(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype))

@@ -1,0 +1,61 @@
+"""Contact with the body as a Newton step needs it: energy, derivative and blocks from one look at the body."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ncs_jax.energies.contact.collision import collision
+from ncs_jax.energies.contact.smooth import Quadrics, blended_contact, nearby_quadrics
+from ncs_jax.energies.contact.surface import Surface
+from ncs_jax.energies.terms import Material, Terms
+from ncs_jax.energies.total import distances
+
+__all__ = ["Contact", "touching"]
+
+
+class Contact(NamedTuple):
+    """How a garment touches the body. The blocks are those of Gauss and Newton: positive semi-definite."""
+
+    energy: Float[Array, ""]  # J
+    gradient: Float[Array, "verts 3"]  # N
+    blocks: Float[Array, "verts 3 3"]  # N/m
+    distance: Float[Array, "verts"]  # m
+
+
+def touching(
+    x: Float[Array, "verts 3"],
+    body: Float[Array, "body 3"],
+    surface: Surface,
+    material: Material,
+    terms: Terms,
+    near: Quadrics | None = None,
+    only: Int[Array, "some"] | None = None,
+) -> Contact:
+    """Contact of all vertices, each of which touches the body by itself.
+
+    Args:
+        x, body: positions in m. near: the body near the garment, where contact is smooth and it is known already.
+        only: of smooth contact, the vertices that count; the others are taken as far away.
+    """
+    stiffness = material.collision
+    if terms.collision != "smooth":
+        distance, back = jax.vjp(lambda x: distances(x, body, surface, terms), x)
+        (normal,) = back(jnp.ones_like(distance))
+        energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness)
+        pushing = jnp.where(distance < material.thickness, 2 * stiffness, 0)
+        blocks = pushing[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        return Contact(energy, slope[:, None] * normal, blocks, distance)
+    near = nearby_quadrics(x, body, surface) if near is None else near
+
+    found = blended_contact(x, near, surface, material.thickness, only)
+    energy, gradient = stiffness * jnp.sum(found.shortfall), stiffness * found.slope
+    blocks, distance = 2 * stiffness * found.directions, found.distance
+    if only is not None:
+        gradient = jnp.zeros_like(x).at[only].set(gradient)
+        blocks = jnp.zeros((*x.shape, 3), x.dtype).at[only].set(blocks)
+        distance = jnp.full(x.shape[:1], jnp.inf, x.dtype).at[only].set(distance)
+    return Contact(energy, gradient, blocks, distance)

@@ -1,0 +1,205 @@
+"""Second derivatives of the total energy, made positive semi-definite element by element (Teran et al. 2005).
+
+The matrix is one 3x3 block a vertex and one a pair of vertices that share a face or a hinge, as `cholesky` takes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ncs_jax.energies.contact.friction import SLIP, slipping
+from ncs_jax.energies.membrane import deformation
+from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
+from ncs_jax.geometry.mesh import Mesh, corners, dihedral
+from ncs_jax.geometry.numerics import norm, normalize, positive_part
+
+__all__ = ["Couplings", "couplings_from", "multiply", "stiffness"]
+
+FACE = ((0, 1), (1, 2), (2, 0))
+HINGE = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Couplings:
+    """Which pairs of vertices share an element, and where every element's blocks go.
+
+    Block k couples pairs[k, 0] (rows) with pairs[k, 1] (columns); an element that holds them the other way round adds its
+    block transposed.
+    """
+
+    pairs: Int[Array, "pairs 2"]
+    face_pairs: Int[Array, "3 faces"]
+    face_flips: Bool[Array, "3 faces"]
+    hinge_pairs: Int[Array, "6 hinges"]
+    hinge_flips: Bool[Array, "6 hinges"]
+    edge_pairs: Int[Array, "edges"]  # its block is symmetric: it has no flips
+
+
+def couplings_from(mesh: Mesh) -> Couplings:
+    """All pairs of vertices that a face or a hinge couples."""
+    faces, hinges = np.asarray(mesh.faces), np.asarray(mesh.hinges)
+    of_faces = np.stack([faces[:, p] for p in FACE])
+    of_hinges = np.stack([hinges[:, p] for p in HINGE])
+    every = np.sort(np.concatenate([of_faces.reshape(-1, 2), of_hinges.reshape(-1, 2)]), axis=1)
+    pairs = np.unique(every, axis=0)
+    size = [len(mesh.rest), 1]
+
+    def place(p):
+        index = np.searchsorted(pairs @ size, np.sort(p, axis=-1) @ size)
+        return jnp.asarray(index, jnp.int32), jnp.asarray(p[..., 0] > p[..., 1])
+
+    edges, _ = place(np.asarray(mesh.edges))
+    return Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges), edge_pairs=edges)
+
+
+def _membrane(x, mesh: Mesh, density, numbers):
+    """Blocks (3 corners, 3 corners, faces, 3, 3) of the faces' Hessians, each made positive semi-definite.
+
+    A density depends on lengths and angles only, so seen in the face's own frame (t, s, n) its Hessian has two parts: that of
+    the material within the plane, 4x4, and the stress, 2x2, which acts alike on all three axes. Each loses its negative part.
+    """
+    w = jnp.stack([jnp.stack(column, axis=-1) for column in deformation(x, mesh)])
+    t, s = _plane(w)
+    zero = jnp.zeros_like(w[..., 0])
+    flat = jnp.stack([jnp.sum(w * t[None], axis=-1), jnp.sum(w * s[None], axis=-1), zero], axis=1)
+    _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density([[*w[0]], [*w[1]]], *numbers))), flat)
+
+    def column(i, a):
+        return along(jnp.zeros_like(flat).at[i, a].set(1))
+
+    out = [column(j, 2) for j in range(2)]
+    stress = jnp.stack([jnp.stack([out[j][i, 2] for j in range(2)]) for i in range(2)])
+    inner = jnp.stack([column(j, b)[:, a] for j in range(2) for b in range(2) for a in range(2)])
+    inner = inner.reshape(2, 2, 2, 2, -1).transpose(3, 2, 0, 1, 4)  # (i, a, j, b, faces)
+    inner = inner - stress[:, None, :, None] * jnp.eye(2, dtype=x.dtype)[None, :, None, :, None]
+    material = positive_part(inner.reshape(4, 4, -1)).reshape(2, 2, 2, 2, -1)
+    pull = positive_part(stress)
+    area = mesh.face_area
+    axes = jnp.stack([t, s])
+    eye = jnp.eye(3, dtype=x.dtype)
+    shape = jnp.stack([-mesh.face_axes[:, 0] - mesh.face_axes[:, 1], mesh.face_axes[:, 0], mesh.face_axes[:, 1]])
+    blocks = {}
+    for k in range(3):
+        for other in range(3):
+            # w_i = sum_k shape_ki x_k
+            weight = {(i, j): area * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
+            even = sum((weight[i, j] * pull[i, j] for i, j in weight), start=jnp.zeros_like(area))
+            block = even[:, None, None] * eye[None]
+            for a in range(2):
+                for b in range(2):
+                    within = sum((weight[i, j] * material[i, a, j, b] for i, j in weight), start=jnp.zeros_like(area))
+                    block = block + within[:, None, None] * axes[a, :, :, None] * axes[b, :, None, :]
+            blocks[k, other] = block
+    return blocks
+
+
+def _plane(w):
+    """Two orthogonal unit vectors (faces, 3) in the plane of every face; any two where it is collapsed."""
+    longer = jnp.sum(w[0] * w[0], axis=-1) >= jnp.sum(w[1] * w[1], axis=-1)
+    t = normalize(jnp.where(longer[:, None], w[0], w[1]))
+    t = jnp.where(jnp.any(t != 0, axis=-1, keepdims=True), t, jnp.eye(3, dtype=w.dtype)[0])
+    n = normalize(jnp.cross(w[0], w[1]))
+    least = jnp.eye(3, dtype=w.dtype)[jnp.argmin(jnp.abs(t), axis=-1)]
+    n = jnp.where(jnp.any(n != 0, axis=-1, keepdims=True), n, normalize(jnp.cross(t, least)))
+    return t, normalize(jnp.cross(n, t))
+
+
+def _springs(x, mesh: Mesh, stiffness):
+    """The block (edges, 3, 3) of every spring, its pull across taken as zero where it is compressed."""
+    gap = x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]
+    length = norm(gap)
+    safe = jnp.where(length > 0, length, 1)
+    along = gap / safe[:, None]
+    across = jnp.where(length > 0, jnp.maximum(1 - mesh.edge_length / safe, 0), 0)
+    outer = along[:, :, None] * along[:, None, :]
+    eye = jnp.eye(3, dtype=x.dtype)
+    return (stiffness * mesh.edge_weight)[:, None, None] * (across[:, None, None] * (eye[None] - outer) + outer)
+
+
+def _bending(x, mesh: Mesh, stiffness):
+    """Gradients of the angles (hinges, 4, 3) and weights (hinges,): the Gauss-Newton part, which is what is definite."""
+    areas = jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)
+    gradient = jax.grad(lambda hinge: jnp.sum(dihedral(hinge, [areas[:, 0], areas[:, 1]])))(corners(x, mesh.hinges))
+    gradient = jnp.stack([jnp.stack(corner, axis=-1) for corner in gradient], axis=1)
+    solid = jnp.all(mesh.hinge_area > 0, axis=-1)
+    return gradient, jnp.where(solid, 2 * stiffness * mesh.hinge_length**2 / (8 * jnp.sum(areas, axis=-1)), 0)
+
+
+def _friction(x, frame: StepInputs, coefficient):
+    """The blocks (verts, 3, 3) of friction, which is convex."""
+    along, normal = slipping(x, frame.carried, frame.pressed)
+    length, slip = norm(along), SLIP * frame.dt
+    within = jnp.eye(3, dtype=x.dtype)[None] - normal[:, :, None] * normal[:, None, :]
+    way = jnp.where((length < slip)[:, None], 0, normalize(along))
+    push = coefficient * norm(frame.pressed) / jnp.maximum(length, slip)
+    return push[:, None, None] * (within - way[:, :, None] * way[:, None, :])
+
+
+def stiffness(
+    x: Float[Array, "verts 3"],
+    couplings: Couplings,
+    garment: Garment,
+    material: Material,
+    frame: StepInputs,
+    terms: Terms,
+    contact: Float[Array, "verts 3 3"] | None = None,
+) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
+    """Blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
+
+    contact: the blocks of collision, where there is any, from `contact.touching`.
+
+    The membrane's element Hessians are projected; springs lose their negative part in closed form; bending
+    enters by the squares of its first derivatives (Gauss-Newton), exact where the angle is at its rest value.
+    """
+    mesh = garment.mesh
+    diagonal = jnp.zeros((*x.shape, 3), x.dtype)
+    off = jnp.zeros((couplings.pairs.shape[0], 3, 3), x.dtype)
+
+    def turned(block, flip):
+        return jnp.where(flip[:, None, None], jnp.swapaxes(block, -1, -2), block)
+
+    if terms.membrane == "mass_spring":
+        block = _springs(x, mesh, *material.membrane)
+        diagonal = diagonal.at[mesh.edges].add(block[:, None])
+        off = off.at[couplings.edge_pairs].add(-block)
+    elif terms.membrane is not None:
+        blocks = _membrane(x, mesh, DENSITIES[terms.membrane], material.membrane)
+        diagonal = diagonal.at[mesh.faces.T].add(jnp.stack([blocks[k, k] for k in range(3)]))
+        parts = jnp.stack([turned(blocks[k], couplings.face_flips[i]) for i, k in enumerate(FACE)])
+        off = off.at[couplings.face_pairs].add(parts)
+    if terms.bending:
+        gradient, weight = _bending(x, mesh, material.bending)
+        scaled = gradient * weight[:, None, None]
+        diagonal = diagonal.at[mesh.hinges].add(scaled[..., :, None] * gradient[..., None, :])
+        sides = [scaled[:, k, :, None] * gradient[:, other, None, :] for k, other in HINGE]
+        off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
+    if contact is not None:
+        diagonal = diagonal + contact
+    if terms.friction:
+        diagonal = diagonal + _friction(x, frame, material.friction)
+    if terms.pinning:
+        pins = garment.pins
+        linear = frame.blended[pins][..., :3]
+        inverse = jnp.linalg.inv(linear)
+        square = jnp.einsum("pia,pib->pab", inverse, inverse, precision="highest")
+        diagonal = diagonal.at[pins].add(2 * material.pinning * square)
+    return diagonal, off
+
+
+def multiply(
+    couplings: Couplings,
+    diagonal: Float[Array, "verts 3 3"],
+    off: Float[Array, "pairs 3 3"],
+    p: Float[Array, "verts 3"],
+) -> Float[Array, "verts 3"]:
+    """The matrix times a field of vectors."""
+    i, j = couplings.pairs.T
+    result = jnp.sum(diagonal * p[:, None, :], axis=-1)
+    result = result.at[i].add(jnp.sum(off * p[j][:, None, :], axis=-1))
+    return result.at[j].add(jnp.sum(off * p[i][:, :, None], axis=-2))

@@ -1,0 +1,32 @@
+"""Which frames training takes at each step: pure functions of seed and step, so that a resumed run sees the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+__all__ = ["CHUNK", "batches", "chunks"]
+
+
+CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
+
+
+def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
+    """The last frames of the windows of steps first .. first + count, (count, batch): every frame once a round, shuffled.
+
+    A pure function of its arguments, so that a resumed run sees what an unbroken one would have seen.
+    """
+    wanted = np.arange(first * batch, (first + count) * batch)
+    rounds = wanted // frames
+    shuffled = {r: np.random.default_rng([seed, int(r)]).permutation(frames) for r in np.unique(rounds)}
+    picked = np.stack([shuffled[r][i] for r, i in zip(rounds, wanted % frames, strict=True)])
+    return picked.reshape(count, batch).astype(np.int32)
+
+
+def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:
+    """(first step, count) of every chunk up to `steps`, cut at the multiples of CHUNK wherever a run resumes."""
+    while first < steps:
+        upto = min((first // CHUNK + 1) * CHUNK, steps)
+        yield first, upto - first
+        first = upto

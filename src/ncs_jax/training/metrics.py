@@ -1,0 +1,80 @@
+"""What training looks at between steps, and why a step was dropped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.total import distances
+from ncs_jax.geometry.numerics import norm
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.network.methods.method import Method, decode, garment_blend
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.training.loss import physics
+from ncs_jax.training.step import Fault
+
+__all__ = ["diagnose", "training_metrics"]
+
+
+def training_metrics(
+    model: Model, network: Method, window: int, params, track: MotionFeatures, ends
+) -> dict[str, Float[Array, ""]]:
+    """Mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
+
+    Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
+    """
+    codes = network.windows(params, track, ends, window, 1)
+    offsets = decode(network, params, model, *(c if c is None else c[-1] for c in (codes.together(), codes.swung())))
+    weights = garment_blend(network, params, model)
+    mesh = model.garment.mesh
+
+    def one(args):
+        offset, matrices = args
+        x = skin(blend(matrices, weights), mesh.rest + offset)
+        length = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
+        strain = jnp.abs(length / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+        result = {"strain": 100 * jnp.mean(strain)}
+        if model.terms.collision is not None:
+            d = distances(x, pose_body(model, matrices), model.surface, model.terms)
+            result["penetrating"] = 100 * jnp.mean(d < 0)
+        return result
+
+    each = (jnp.moveaxis(offsets, -1, 0), track.matrices[ends])
+    found = {k: jnp.mean(v) for k, v in lax.map(one, each).items()}
+    if codes.dynamic is not None:
+        moved = offsets - decode(network, params, model, codes.static[-1])
+        found["moved"] = 1000 * jnp.mean(norm(jnp.moveaxis(moved, 1, -1)))
+    return found
+
+
+def diagnose(model: Model, network: Method, params, track: MotionFeatures, fault: Fault) -> str:
+    """Which term of a dropped step went non-finite, in which frame, and at which vertex first."""
+    model, frame = replace(model, terms=network.loss(model.terms)), int(fault.frame)
+    history = 3 if model.terms.inertia else 1
+    back = jnp.maximum(frame - jnp.arange(history), track.start[frame])
+    weights = garment_blend(network, params, model)
+    matrices, share = track.matrices[back][..., None], jnp.ones(1, fault.offsets.dtype)
+    last = fault.offsets[0]
+
+    def value(last):
+        offsets = [frame[..., None] for frame in (last, *fault.offsets[1:history])]
+        return {name: energy[0] for name, energy in physics(model, weights, offsets, matrices, share)[0].items()}
+
+    if not bool(jnp.all(jnp.isfinite(last))):
+        return f"step {int(fault.step)}, frame {frame}: the network's own output is not finite"
+    parts = jax.jit(value)(last)
+    for name, energy in parts.items():
+        gradient = jax.jit(jax.grad(lambda o, n=name: value(o)[n]))(last)
+        bad = ~np.isfinite(np.asarray(gradient)).all(axis=1)
+        if not np.isfinite(float(energy)) or bad.any():
+            vertex = int(bad.argmax()) if bad.any() else -1
+            faces = np.flatnonzero((np.asarray(model.garment.mesh.faces) == vertex).any(axis=1))
+            where = f"vertex {vertex}" + (f" (face {faces[0]})" if faces.size else "") if vertex >= 0 else "an unknown element"
+            return f"step {int(fault.step)}, frame {frame}: {name} is not finite at {where}"
+    return f"step {int(fault.step)}, frame {frame}: the gradient of the parameters is not finite"

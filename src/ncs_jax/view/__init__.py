@@ -1,0 +1,3 @@
+"""Pictures, pages and the live view."""
+
+__all__: list[str] = []
