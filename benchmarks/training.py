@@ -29,16 +29,16 @@ from ncs_jax import assemble, local_rotations
 from ncs_jax.energies.elements import elastic
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import contact_force, distances, energies
-from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.geometry.skinning import blend
 from ncs_jax.network.methods.method import garment_blend
 from ncs_jax.prepare.build import Assembly
 from ncs_jax.scene.features import motion_features
-from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.model import Model, pose_body, pose_garment
 from ncs_jax.scene.spec import Scene
 from ncs_jax.training.batches import CHUNK, batches
 from ncs_jax.training.devices import give_back
 from ncs_jax.training.loss import gradients, physics, with_bodies
-from ncs_jax.training.step import TrainState, chunk_runner, initial_state
+from ncs_jax.training.step import Task, TrainState, chunk_runner, initial_state, windows_of
 
 STEPS = 1000  # of the schedule
 NOTHING = Terms(None, bending=False, collision=None, gravity=False, inertia=False)
@@ -85,7 +85,9 @@ def _energy(model: Model, name: str) -> Callable:
             given = dict(brought)
             if name == "friction":
                 near = replace(terms, collision=model.terms.collision)
-                given["pressed"] = contact_force(given["carried"], given["body"], model.surface, near, model.material)
+                given["lagged_normal_force"] = contact_force(
+                    given["advected"], given["body"], model.surface, near, model.material
+                )
             parts = energies(x, model.garment, model.material, StepInputs(1 / model.fps, **given), terms, model.surface)
             return jnp.sum(parts[name])
 
@@ -99,7 +101,8 @@ def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple
     """Every part that the scene has, by name: a function, what it depends on, and its constants."""
     model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
     terms, params = model.terms, state.params
-    offsets = jax.jit(lambda p: gradients(model, network, spec, p, whole, ends, pairs))(params)[2][1]
+    windows = functools.partial(windows_of, Task(model, network, spec))  # within a trace
+    offsets = jax.jit(lambda p: gradients(model, network, p, whole, windows(ends, pairs)))(params)[2][1]
     history = len(offsets)
     back = jnp.maximum(ends[None] - jnp.arange(history, dtype=ends.dtype)[:, None], whole.start[ends][None])
     matrices = jnp.moveaxis(whole.matrices[back], 1, -1)
@@ -110,10 +113,10 @@ def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple
 
     def networks(whole, params, model):
         with mock.patch("ncs_jax.training.loss.physics", unmoved):
-            return gradients(model, network, spec, params, whole, ends, pairs)
+            return gradients(model, network, params, whole, windows(ends, pairs))
 
     def pose(offset, matrices, model):
-        return skin(blend(matrices, weights), model.garment.mesh.rest[:, :, None] + offset)
+        return pose_garment(model, offset, matrices, weights)
 
     def skinned(varied, model):
         offsets, matrices = varied
@@ -145,9 +148,9 @@ def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple
             alone = replace(NOTHING, **{name: value})
             found[name] = (lambda x, model, alone=alone: elastic(x, model.garment, model.material, alone), x, model)
     if terms.friction:
-        brought["friction"] = {"body": body["body"], "carried": pose(offsets[1], matrices[0], model)}
+        brought["friction"] = {"body": body["body"], "advected": pose(offsets[1], matrices[0], model)}
     if terms.pinning:
-        brought["pinning"] = {"blended": blend(matrices[0], weights)}
+        brought["pinning"] = {"vertex_transforms": blend(matrices[0], weights)}
     for name in ("collision", "friction", "gravity", "inertia", "pinning", "self_contact"):
         if getattr(terms, name):
             found[name] = (_energy(model, name), (x, brought.get(name, {})), model)
@@ -167,7 +170,8 @@ def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple
 def optimiser(assembly: Assembly, state: TrainState, ends, pairs) -> tuple:
     """All of a step but its gradient, which is taken as given: as a step of `advanced`, its carry, and its constants."""
     model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
-    given = jax.eval_shape(lambda p: gradients(model, network, spec, p, whole, ends, pairs), state.params)
+    windows = functools.partial(windows_of, Task(model, network, spec))
+    given = jax.eval_shape(lambda p: gradients(model, network, p, whole, windows(ends, pairs)), state.params)
     given = jax.tree.map(lambda s: jnp.full(s.shape, 1e-6, s.dtype), given)
 
     def update(carry, model, whole):

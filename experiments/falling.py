@@ -104,7 +104,9 @@ def energy(case: Case, now, previous, before, stop: bool) -> tuple[Array, Float[
     """The energy (10) of a frame in J from its coefficients and those of the two before, and where the sheet is."""
     model, modes = replace(case.model, terms=replace(case.model.terms, through_time=not stop)), case.modes
     x, *earlier = (case.start + modes @ c for c in (now, previous, before))
-    frame = StepInputs(1 / model.fps, *earlier, blended=blend(jnp.broadcast_to(jnp.eye(3, 4), (1, 3, 4)), model.blend))
+    frame = StepInputs(
+        1 / model.fps, *earlier, vertex_transforms=blend(jnp.broadcast_to(jnp.eye(3, 4), (1, 3, 4)), model.blend)
+    )
     return total(x, model.garment, model.material, frame, model.terms), x
 
 

@@ -33,8 +33,8 @@ class Specimen:
     faces: np.ndarray
     pins: np.ndarray
     three: np.ndarray  # (3, verts, 3): now, and the two frames before
-    carried: np.ndarray
-    blended: np.ndarray  # (verts, 3, 4)
+    advected: np.ndarray
+    transforms: np.ndarray  # (verts, 3, 4)
     body: np.ndarray
     body_faces: np.ndarray
     along: np.ndarray
@@ -97,14 +97,14 @@ def along_axis(s: Specimen, axis: str, value: float) -> Specimen:
         return replace(s, material=replace(s.material, density=jnp.float32(value)))
     if axis.startswith("gravity"):
         return replace(s, material=scaled(s.material, value, "gravity"))
-    moved = s.blended.copy()
+    moved = s.transforms.copy()
     if axis.startswith("size"):
         moved[..., 3] *= value
-        lengths = {name: value * getattr(s, name) for name in ("rest", "three", "carried", "body")}
-        return replace(s, blended=moved, material=scaled(s.material, value, "thickness", "self_thickness"), **lengths)
+        lengths = {name: value * getattr(s, name) for name in ("rest", "three", "advected", "body")}
+        return replace(s, transforms=moved, material=scaled(s.material, value, "thickness", "self_thickness"), **lengths)
     away = value * np.array([0.6, 0.64, 0.48])
     moved[..., 3] += away
-    return replace(s, blended=moved, **{name: getattr(s, name) + away for name in ("three", "carried", "body")})
+    return replace(s, transforms=moved, **{name: getattr(s, name) + away for name in ("three", "advected", "body")})
 
 
 def shapes(s: Specimen) -> Iterator[tuple[str, Specimen]]:
@@ -198,14 +198,14 @@ def evaluated(s: Specimen, names: Sequence[str], dtype: Any) -> dict[str, tuple]
         terms = TERMS[name]
         own = replace(material, membrane=tuple(map(array, s.membranes.get(name, ()))))
         on = smooth if terms.collision == "smooth" else surface
-        pressed = None
+        lagged = None
         if terms.friction:
-            pressed = contact_force(array(s.carried), array(s.body), on, replace(ALONE, collision="plane"), own)
+            lagged = contact_force(array(s.advected), array(s.body), on, replace(ALONE, collision="plane"), own)
         groups = groups_from(mesh) if terms.self_contact else None
         if groups is not None and crowded(array(s.three[0]), mesh, groups, own.self_thickness):
             continue
         frame = StepInputs(
-            array(s.dt), array(s.three[1]), array(s.three[2]), array(s.body), array(s.blended), array(s.carried), pressed
+            array(s.dt), array(s.three[1]), array(s.three[2]), array(s.body), array(s.transforms), array(s.advected), lagged
         )
         garment = Garment(mesh, jnp.asarray(s.pins, jnp.int32), groups)
         found[name] = derivatives(terms, array(s.three[0]), array(s.along), garment, own, frame, on)

@@ -61,7 +61,7 @@ def situation():
         previous=jnp.asarray(x + 3e-4 * rng.normal(size=x.shape)),
         before=jnp.asarray(x + 3e-4 * rng.normal(size=x.shape)),
         body=jnp.asarray(body),
-        blended=jnp.broadcast_to(jnp.asarray(turn), (len(x), 3, 4)),
+        vertex_transforms=jnp.broadcast_to(jnp.asarray(turn), (len(x), 3, 4)),
     )
     return jnp.asarray(x), garment, frame, surface_from(rest, body, triangles)
 
@@ -126,8 +126,8 @@ def test_a_term_that_is_off_is_not_traced(off, differentiate):
     [
         (("inertia",), {"previous": None, "before": None}),
         (("collision",), {"body": None}),
-        (("pinning",), {"blended": None}),
-        (("inertia", "collision", "pinning"), {"previous": None, "before": None, "body": None, "blended": None}),
+        (("pinning",), {"vertex_transforms": None}),
+        (("inertia", "collision", "pinning"), {"previous": None, "before": None, "body": None, "vertex_transforms": None}),
     ],
 )
 def test_a_frame_brings_only_what_is_asked_for(off, lacking):
@@ -337,7 +337,7 @@ def test_the_world_may_be_turned():
     x, _, frame, surface = situation()
     turn = rotation([1, 1, -2], 1.9)
     move = lambda a: a @ turn.T  # noqa: E731
-    blended = jnp.einsum("ab,vbc->vac", turn, frame.blended)
+    blended = jnp.einsum("ab,vbc->vac", turn, frame.vertex_transforms)
     there = StepInputs(frame.dt, move(frame.previous), move(frame.before), move(frame.body), blended)
     here, _, pull = compiled(x, material(), frame, surface)
     other, _, turned_pull = compiled(move(x), material(gravity=turn @ DOWN), there, surface)
@@ -350,11 +350,11 @@ def test_pins_hold_where_skinning_puts_them():
     x, garment, frame, _ = situation()
     terms = dataclasses.replace(ALL, **{**OFF, "pinning": True})
     value = jax.jit(lambda x: total(x, garment, material(), frame, terms))
-    posed = jnp.sum(frame.blended[..., :3] * garment.mesh.rest[:, None], axis=-1) + frame.blended[..., 3]
+    posed = jnp.sum(frame.vertex_transforms[..., :3] * garment.mesh.rest[:, None], axis=-1) + frame.vertex_transforms[..., 3]
     assert value(posed) < 1e-25
     free = jnp.ones(len(x), bool).at[garment.pins].set(False)
     np.testing.assert_array_equal(value(jnp.where(free[:, None], posed + 1.0, posed)), value(posed))
-    apart = unpose(frame.blended, x)[garment.pins] - garment.mesh.rest[garment.pins]
+    apart = unpose(frame.vertex_transforms, x)[garment.pins] - garment.mesh.rest[garment.pins]
     np.testing.assert_allclose(value(x), 1000 * jnp.sum(apart**2), rtol=1e-12)
 
 

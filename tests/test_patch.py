@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from ncs_jax.energies.contact.smooth import nearby_quadrics
-from ncs_jax.scene.model import pose_body
+from ncs_jax.scene.step_inputs import Past, step_inputs
 from ncs_jax.simulation.implicit_euler import simulator_from
 from ncs_jax.simulation.solver import minimise
 from ncs_jax.simulation.solver import problem as frame
@@ -21,8 +22,8 @@ from .test_simulator import written
 from .test_stiffness import dense
 from .verification.newton import QUICK
 
-evaluated = jax.jit(frame.evaluated, compiler_options=QUICK)
-relaxed = jax.jit(minimise.relaxed, compiler_options=QUICK)
+evaluated = jax.jit(frame.evaluate, compiler_options=QUICK)
+relaxed = jax.jit(minimise.relax_patch, compiler_options=QUICK)
 
 
 @pytest.fixture(scope="module", params=["stvk", "mass_spring"])
@@ -31,13 +32,14 @@ def problem(request, tmp_path_factory):
     physics = {"membrane": {"model": request.param}, "collision": {"distance": "smooth"}}
     assembly = written(tmp_path_factory.mktemp("patch"), *grid(25, 25, 0.012, (0, 0.4, 0.082)), **physics)
     model = assembly.model
-    body = pose_body(model, assembly.track.matrices[0])
     rest = model.garment.mesh.rest
+    model = replace(model, terms=replace(model.terms, inertia=True, through_time=True))
+    inputs = step_inputs(model, assembly.track.matrices[0], Past(rest, rest, moving=jnp.asarray(1.0)))
     noise = np.random.default_rng(5).normal(size=(60, 3)) * (np.arange(60) % 25 < 6)[:, None]
     x = rest.at[:60].add(1e-3 * noise)
-    near = jax.jit(nearby_quadrics)(x, body, model.surface)
+    near = frame.Neighbours(jax.jit(nearby_quadrics)(x, inputs.body, model.surface), None, x)
     simulator = simulator_from(model)
-    step = frame.Problem(model, simulator.couplings, simulator.order, body, None, rest, None, jnp.asarray(1.0), near=near)
+    step = frame.Problem(model, simulator.couplings, simulator.order, inputs, neighbours=near)
     score = frame.imbalance(step, evaluated(step, x)[1] - evaluated(step, rest)[1])
     patch = jax.jit(patch_around)(score, model, step.couplings)
     assert patch.whole
@@ -69,7 +71,7 @@ def test_forces_and_changes_of_energy_are_those_of_the_whole(problem, rng):
 def test_its_solve_is_that_of_the_dense_matrix(problem):
     step, x, patch = problem
     gradient = evaluated(step, x)[1]
-    blocks = partial(jax.jit(frame.blocks, compiler_options=QUICK), x=x)
+    blocks = partial(jax.jit(frame.stiffness_blocks, compiler_options=QUICK), x=x)
     local = minimise._on_patch(step, patch)
     found = jax.jit(solve_dense)(patch, *blocks(local, point=evaluated(local, x)), gradient)
     whole = dense(step.couplings, *blocks(step, point=evaluated(step, x))).reshape(len(x), 3, len(x), 3)

@@ -16,7 +16,7 @@ from ncs_jax.energies.terms import MEMBRANES, Garment, StepInputs, Terms
 from ncs_jax.energies.total import distances, total
 from ncs_jax.geometry.mesh import corners, dihedral, mesh_from
 from ncs_jax.geometry.skinning import skin
-from ncs_jax.simulation.solver.contact import touching
+from ncs_jax.simulation.solver.contact import evaluate_contact
 from ncs_jax.simulation.solver.stiffness import couplings_from, multiply, stiffness
 
 from .shapes import ball, rotation, sheet, tube
@@ -46,7 +46,7 @@ def garment(shape, dtype=jnp.float64, seed=None):
 
 @partial(jax.jit, static_argnames="terms", compiler_options=QUICK)
 def blocks(x, couplings, cloth, numbers, frame, terms, surface=None):
-    contact = None if terms.collision is None else touching(x, frame.body, surface, numbers, terms).blocks
+    contact = None if terms.collision is None else evaluate_contact(x, frame.body, surface, numbers, terms).blocks
     return stiffness(x, couplings, cloth, numbers, frame, terms, contact)
 
 
@@ -202,7 +202,7 @@ def on_a_ball():
     x = rest + 2e-3 * np.random.default_rng(4).normal(size=rest.shape)
     turn = 0.6 * rotation([1, 2, 3], 1.2) + 0.4 * rotation([0, 1, 0], -0.5)
     blended = jnp.broadcast_to(jnp.asarray(np.concatenate([turn, [[0.01], [0.0], [0.02]]], axis=1)), (20, 3, 4))
-    return jnp.asarray(x), StepInputs(body=jnp.asarray(body), blended=blended), surface_from(rest, body, triangles)
+    return jnp.asarray(x), StepInputs(body=jnp.asarray(body), vertex_transforms=blended), surface_from(rest, body, triangles)
 
 
 def test_collision_with_planes_is_the_hessian():
@@ -252,7 +252,7 @@ def test_pinning_is_the_hessian():
     terms = dataclasses.replace(NOTHING, pinning=True)
     right = np.asarray(hessian(x, garment("sheet")[0], material(), frame, terms))
     np.testing.assert_allclose(assembled(x, "sheet", terms, frame=frame), right, rtol=0, atol=1e-9 * np.abs(right).max())
-    still = np.asarray(skin(frame.blended, garment("sheet")[0].mesh.rest))
+    still = np.asarray(skin(frame.vertex_transforms, garment("sheet")[0].mesh.rest))
     assert np.abs(still - np.asarray(x)).max() > 0.01 and np.abs(right).max() > 1000
 
 
@@ -283,7 +283,7 @@ def read(terms):
     names = [f.name for f in dataclasses.fields(numbers) for _ in jax.tree.leaves(getattr(numbers, f.name))]
 
     def made(n):
-        contact = None if terms.collision is None else touching(x, frame.body, surface, n, terms).blocks
+        contact = None if terms.collision is None else evaluate_contact(x, frame.body, surface, n, terms).blocks
         return stiffness(x, couplings, cloth, n, frame, terms, contact)
 
     traced = jax.make_jaxpr(made)(numbers).jaxpr

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
 from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 from ncs_jax.training.loss import gradients
-from ncs_jax.training.step import initial_state
+from ncs_jax.training.step import Task, initial_state, windows_of
 
 from .scenes import grid, write_scene
 from .test_rollout import edited, ready, run
@@ -63,7 +64,7 @@ def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
     simulator = simulator_from(model)
     (x,), _ = jax.jit(simulate)(simulator, jax.tree.map(lambda a: a[:1], track))
     blended = blend(track.matrices[0], model.blend)
-    frame = StepInputs(1 / model.fps, blended=blended)
+    frame = StepInputs(1 / model.fps, vertex_transforms=blended)
     u = jnp.einsum("vij,vjk->vik", blended[:, :, :3], found.directions)
 
     def along(q):
@@ -162,7 +163,7 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
     others = jnp.concatenate([ends[pairs[:2]], ends[2:]])
     size = np.linalg.norm(track.swing, axis=1)
     share = jnp.asarray([0.0, size.max() / max(size[others[1]], QUIET * size.max()), 1.0, 1.0])
-    fixed = network.mixed(params, track, ends, others, share).static
+    fixed = network.static.apply({"params": params["static"]}, track.static[ends])
     terms, rest = network.loss(model.terms), model.garment.mesh.rest
     mass, d = model.material.density * model.garment.mesh.vertex_area, model.vibrations.directions
 
@@ -174,15 +175,16 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
     still = decoded(params, fixed)
 
     def loss(params):
-        codes = network.mixed(params, track, ends, others, share)
-        y = decoded(params, codes.together())
+        z = network.static.apply({"params": params["static"]}, track.static[ends])
+        swing = share[:, None] * track.swing[others]
+        y = decoded(params, z + network.dynamic.apply({"params": params["dynamic"]}, swing))
         value = 0.0
         for i in range(len(ends)):
             m = track.matrices[ends[i]]
             blended = blend(m, model.blend)
             x = skin(blended, rest + y[..., i] + d @ (share[i] * track.swing[others[i]]))
             body = None if model.body is None else pose_body(model, m)
-            frame = StepInputs(1 / model.fps, body=body, blended=blended)
+            frame = StepInputs(1 / model.fps, body=body, vertex_transforms=blended)
             value += total(x, model.garment, model.material, frame, terms, model.surface)
             c = jnp.einsum("vik,v,vi->k", d, mass, y[..., i] - still[..., i])
             q, r = share[i] * track.swing[others[i]], c / moved
@@ -190,7 +192,8 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
         return value / len(ends)
 
     value, expected = jax.value_and_grad(loss)(params)
-    found, parts, _ = jax.jit(lambda p: gradients(model, network, spec, p, track, ends, pairs))(params)
+    windows = partial(windows_of, Task(model, network, spec))
+    found, parts, _ = jax.jit(lambda p: gradients(model, network, p, track, windows(ends, pairs)))(params)
     assert set(parts) == {"bending", "collision", "gravity", "hold", "membrane", "pinning"} and abs(parts["hold"]).max() > 1e-9
     np.testing.assert_allclose(sum(parts.values()).mean(), value, rtol=1e-10)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * (1 + np.abs(b).max())), found, expected)

@@ -18,7 +18,7 @@ from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.training.batches import CHUNK, batches, chunks
 from ncs_jax.training.loss import gradients, physics, with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
-from ncs_jax.training.step import chunk_runner, initial_state, step_size
+from ncs_jax.training.step import Task, chunk_runner, initial_state, step_size, windows_of
 
 from .scenes import write_scene
 
@@ -38,8 +38,10 @@ def prepared(folder, changes=(), dtype=jnp.float32):
 
 
 def one_gradient(assembly, spec, params, ends, pairs):
-    f = jax.jit(lambda model, params, track: gradients(model, assembly.network, spec, params, track, ends, pairs))
-    return f(assembly.model, params, assembly.track)
+    def f(model, params, track):
+        return gradients(model, assembly.network, params, track, windows_of(Task(model, assembly.network, spec), ends, pairs))
+
+    return jax.jit(f)(assembly.model, params, assembly.track)
 
 
 def test_single_precision_energies_agree_with_a_plain_double_precision_reference(tmp_path, rng):

@@ -12,7 +12,7 @@ from ncs_jax.geometry.mesh import Mesh, corners, dihedral, spread
 from ncs_jax.geometry.numerics import arctan2, least_length
 from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, times
 
-__all__ = ["angles", "bending", "fold_gradient", "per_hinge"]
+__all__ = ["angles", "bending", "fold_gradient", "hinge_weight", "per_hinge"]
 
 
 def _wrapped(angle, mesh):
@@ -20,28 +20,29 @@ def _wrapped(angle, mesh):
     return change - 2 * np.pi * jnp.round(change / (2 * np.pi))
 
 
-def _weight(mesh):
+def hinge_weight(mesh: Mesh, stiffness: Float[Array, ""] | float = 1.0) -> Float[Array, "hinges"]:
+    """Return k l^2 / (8 (A0 + A1)) of every hinge, J; zero beside a face of zero area."""
     solid = jnp.all(mesh.hinge_area > 0, axis=-1)
     areas = jnp.sum(jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1), axis=-1)
-    return jnp.where(solid, mesh.hinge_length**2 / (8 * areas), 0)
+    return jnp.where(solid, stiffness * mesh.hinge_length**2 / (8 * areas), 0)
 
 
 def angles(hinge: Sequence[Vector], mesh: Mesh) -> Float[Array, "hinges *poses"]:
-    """How far every hinge is folded from its rest, phi - phi_rest wrapped to (-pi, pi]."""
+    """Return how far every hinge is folded from its rest, phi - phi_rest wrapped to (-pi, pi]."""
     areas = [spread(jnp.where(a > 0, a, 1), hinge[0][0]) for a in (mesh.hinge_area[:, 0], mesh.hinge_area[:, 1])]
     return _wrapped(dihedral(hinge, areas), mesh)
 
 
 def per_hinge(hinge: Sequence[Vector], mesh: Mesh, stiffness) -> Float[Array, "hinges *poses"]:
-    """Energy of every hinge, J; none beside a face of zero area."""
+    """Return the energy of every hinge, J; none beside a face of zero area."""
     change = angles(hinge, mesh)
-    return stiffness * spread(_weight(mesh), change) * change * change
+    return stiffness * spread(hinge_weight(mesh), change) * change * change
 
 
 def fold_gradient(
     x: Float[Array, "verts 3 *poses"], face: Sequence[Vector], mesh: Mesh, stiffness
 ) -> tuple[Float[Array, "hinges *poses"], list[Vector]]:
-    """Energy of every hinge, J, and its gradient face by face, N: one vector (faces, *poses) for each of the three corners.
+    """Return the energy of every hinge, J, and its gradient face by face, N: a vector (faces, *poses) for each corner.
 
         dE/dx_k = q_k n/|n|^2,  q_k = -s_k + (1 - t_i) s_i + t_j s_j,  s_k = dE/dphi_k |e_k| / (2 A),  i = k - 1, j = k + 1
 
@@ -61,7 +62,7 @@ def fold_gradient(
     long = length(edge)
     sine = dot(cross(n0, n1), edge) / jnp.where(long > 0, long, 1)
     change = _wrapped(arctan2(sine, dot(n0, n1)), mesh)
-    weight = stiffness * spread(_weight(mesh), change)
+    weight = stiffness * spread(hinge_weight(mesh), change)
 
     moment = jnp.concatenate([2 * weight * change, jnp.zeros_like(change[:1])])
     squares = [dot(v, v) for v in e]
@@ -78,7 +79,7 @@ def fold_gradient(
 
 
 def bending(x: Float[Array, "verts 3 *poses"], mesh: Mesh, stiffness: Float[Array, ""] | float) -> Float[Array, "*poses"]:
-    """Bending energy in J.
+    """Return the bending energy in J.
 
         E = sum_hinges k l^2 / (8 (A0 + A1)) (phi - phi_rest)^2,  the difference wrapped to (-pi, pi]
 

@@ -1,25 +1,112 @@
-"""Membrane and bending of many poses at once, by elements: the fast path of `total`."""
+"""The fast path of the total energy: values and forces together, by elements, in lanes of poses.
+
+Training, simulation and evaluation all call `energies_and_gradient`. `total` is what it is tested against.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import fold_gradient
+from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.mass_spring import per_edge
 from ncs_jax.energies.membrane import per_face
-from ncs_jax.energies.terms import DENSITIES, Garment, Material, Terms
+from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
+from ncs_jax.energies.total import energies
 from ncs_jax.geometry.mesh import corners
 from ncs_jax.geometry.soa_vectors import plus
 
-__all__ = ["elastic"]
+__all__ = ["elastic", "energies_and_gradient"]
+
+
+def energies_and_gradient(
+    x: Float[Array, "verts 3 *poses"],
+    garment: Garment,
+    material: Material,
+    step: StepInputs,
+    terms: Terms,
+    surface: Surface | None = None,
+) -> tuple[dict[str, Float[Array, "*poses"]], Float[Array, "verts 3 *poses"], Float[Array, "verts 3 4 *poses"] | None]:
+    """Return every term of `total.energies` by name in J, and the derivatives of their sum.
+
+    Returns:
+        The energies; their gradient by x in N; and that by the vertex transforms, which pins and own terms read, else None.
+
+    One pose (verts, 3) is differentiated whole. Several poses (verts, 3, poses) lie beside each other in the vector lanes:
+    membrane and bending by `elastic`, the terms that look at vertices one by one all poses at once, and those that look for
+    what is near a pose at a time.
+    """
+    if x.ndim == 2:
+        return _one_pose(x, garment, material, step, terms, surface)
+    parts, gradient = elastic(x, garment, material, terms)
+    plane = "plane" if terms.collision == "plane" else None
+    lanes = replace(
+        terms, membrane=None, bending=False, collision=plane, friction=False, pinning=False, self_contact=False, own=()
+    )
+
+    def value(x):
+        some = energies(x, garment, material, step, lanes, surface)
+        return jnp.sum(sum(some.values(), start=jnp.zeros((), x.dtype))), some
+
+    slope, some = jax.grad(value, has_aux=True)(x)
+    parts, gradient = parts | some, gradient + slope
+    alone = replace(
+        terms, membrane=None, bending=False, collision=None if plane else terms.collision, gravity=False, inertia=False
+    )
+    if alone.collision is None and not (alone.friction or alone.pinning or alone.self_contact or alone.own):
+        return parts, gradient, None
+
+    def each(one):
+        x, step = one
+        return _one_pose(x, garment, material, step, alone, surface)
+
+    step = replace(step, force=None)
+    if not alone.own:  # which may read all of it
+        step = _needed(step, alone)
+    dt = step.dt
+    one = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, replace(step, dt=None)))
+    some, slope, to_transforms = lax.map(lambda one: each((one[0], replace(one[1], dt=dt))), one)
+    to_transforms = None if to_transforms is None else jnp.moveaxis(to_transforms, 0, -1)
+    return parts | some, gradient + jnp.moveaxis(slope, 0, -1), to_transforms
+
+
+def _needed(step: StepInputs, terms: Terms) -> StepInputs:
+    """What some terms read, so that nothing else is copied pose by pose."""
+    friction = terms.friction
+    return StepInputs(
+        step.dt,
+        body=None if terms.collision is None else step.body,
+        vertex_transforms=step.vertex_transforms if terms.pinning else None,
+        advected=step.advected if friction else None,
+        lagged_normal_force=step.lagged_normal_force if friction else None,
+        moving=step.moving if friction else None,
+    )
+
+
+def _one_pose(x, garment, material, step: StepInputs, terms: Terms, surface):
+    """The same of one pose: the sum of its terms, differentiated."""
+
+    def value(x, transforms):
+        parts = energies(x, garment, material, replace(step, vertex_transforms=transforms), terms, surface)
+        return sum(parts.values(), start=jnp.zeros((), x.dtype)), parts
+
+    transforms = step.vertex_transforms
+    if not (terms.pinning or terms.own) or transforms is None:
+        gradient, parts = jax.grad(value, has_aux=True)(x, transforms)
+        return parts, gradient, None
+    (gradient, to_transforms), parts = jax.grad(value, argnums=(0, 1), has_aux=True)(x, transforms)
+    return parts, gradient, to_transforms
 
 
 def elastic(
     x: Float[Array, "verts 3 *poses"], garment: Garment, material: Material, terms: Terms
 ) -> tuple[dict[str, Float[Array, "*poses"]], Float[Array, "verts 3 *poses"]]:
-    """Membrane and bending of any number of poses at once: their energies as in `energies`, in J, and the gradient in N.
+    """Return membrane and bending of any number of poses at once: their energies as in `energies`, in J, and the gradient in N.
 
     The elements are differentiated by themselves and their forces gathered at the vertices, so that nothing is scattered; with
     poses beside each other (verts, 3, poses) every corner is one run of memory.

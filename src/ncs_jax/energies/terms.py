@@ -18,7 +18,7 @@ from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.geometry.mesh import Mesh
 
-__all__ = ["DENSITIES", "MEMBRANES", "Garment", "Material", "StepInputs", "Terms"]
+__all__ = ["DENSITIES", "MEMBRANES", "Garment", "Material", "OwnTerm", "StepInputs", "Terms"]
 
 
 MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
@@ -32,6 +32,24 @@ DENSITIES: dict[str, Callable[..., Array]] = {  # energy per rest area of the me
     "neo_hookean": _neo_hookean.density,
     "baraff_witkin": _baraff_witkin.density,
 }
+
+
+NAMES = (
+    "membrane",
+    "bending",
+    "collision",
+    "friction",
+    "gravity",
+    "pinning",
+    "external",
+    "inertia",
+    "self_contact",
+    "hold",
+    "total",
+)
+
+OwnTerm = Callable[[Array, "StepInputs"], Array]
+"""A term that the package does not know: `term(x, step) -> energy` in J, differentiable, called by its `__name__`."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +66,20 @@ class Terms:
     through_time: bool = False  # inertia's target carries a gradient
     pinning: bool = False
     self_contact: bool = False
+    own: tuple[OwnTerm, ...] = ()  # terms of one's own, each a pure function of positions and step inputs
+
+    def __post_init__(self):
+        """Check that every own term has a name of its own.
+
+        Raises:
+            ValueError: it has not.
+        """
+        taken = set(NAMES)
+        for term in self.own:
+            name = getattr(term, "__name__", "")
+            if not name.isidentifier() or name in taken:
+                raise ValueError(f"a term of one's own needs a __name__ that no other term has, not {name!r}")
+            taken.add(name)
 
 
 @jax.tree_util.register_dataclass
@@ -80,13 +112,18 @@ class Garment:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StepInputs:
-    """What one frame brings to the energies; `None` where no term asks for it."""
+    """What one step brings to the energies; `None` where no term asks for it. `scene.step_inputs` prepares it.
+
+    With several poses beside each other every array has them as its last axis.
+    """
 
     dt: float | Float[Array, ""] = field(default=1 / 30)  # s
-    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}
-    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}
-    body: Float[Array, "body 3 *poses"] | None = None  # posed
-    blended: Float[Array, "verts 3 4"] | None = None  # skinning transforms of the garment
-    carried: Float[Array, "verts 3"] | None = None  # where the body alone would carry x_{t-1}, m
-    pressed: Float[Array, "verts 3"] | None = None  # `pressure` there, N
-    normals: Float[Array, "body 3 *poses"] | None = None  # of the body, where they are known already
+    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}, m
+    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}, m
+    body: Float[Array, "body 3 *poses"] | None = None  # posed, m
+    vertex_transforms: Float[Array, "verts 3 4 *poses"] | None = None  # what skinning does to every vertex of the garment
+    advected: Float[Array, "verts 3 *poses"] | None = None  # where the body alone would carry x_{t-1}, m
+    lagged_normal_force: Float[Array, "verts 3 *poses"] | None = None  # of contact there, `total.contact_force`, N
+    normals: Float[Array, "body 3 *poses"] | None = None  # of the body's vertices, where they are known already
+    force: Float[Array, "verts 3 *poses"] | None = None  # external, N
+    moving: Float[Array, "*poses"] | None = None  # what inertia and friction count: 0 for a pose that has no past; None: 1

@@ -1,4 +1,4 @@
-"""The total energy (10): the one place that knows every term."""
+"""The total energy, equation (10): the one place that knows every term."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
 from ncs_jax.geometry.skinning import unpose
 
-__all__ = ["contact_force", "distances", "energies", "total"]
+__all__ = ["body_collision", "contact_force", "distances", "energies", "total"]
 
 
 def distances(
@@ -32,7 +32,7 @@ def distances(
     terms: Terms,
     normals: Float[Array, "body 3 *poses"] | None = None,
 ) -> Float[Array, "verts *poses"]:
-    """Signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone.
+    """Return the signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone.
 
     `normals`: of the body's vertices, where they are known; "plane" works them out otherwise.
     """
@@ -45,7 +45,8 @@ def distances(
     return plane_distance(x, body, vertex_normals(body, surface) if normals is None else normals, index)
 
 
-def _collision(x, body, surface, terms, material, normals=None):
+def body_collision(x, body, surface: Surface, terms: Terms, material: Material, normals=None) -> Float[Array, "*poses"]:
+    """Return the energy of collision with the body (12) in J, by the scene's query; arguments as of `distances`."""
     if terms.collision == "smooth":
         near = nearby_quadrics(x, body, surface)
         return material.collision * jnp.sum(blended_contact(x, near, surface, material.thickness).shortfall)
@@ -55,8 +56,8 @@ def _collision(x, body, surface, terms, material, normals=None):
 def contact_force(
     x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms, material: Material
 ) -> Float[Array, "verts 3"]:
-    """How the body's contact resists: its energy's derivative in N, towards the body."""
-    return jax.grad(_collision)(x, body, surface, terms, material)
+    """Return how the body's contact resists: the derivative of `body_collision` in N, towards the body."""
+    return jax.grad(body_collision)(x, body, surface, terms, material)
 
 
 def _self_contact(x, garment, material):
@@ -65,24 +66,32 @@ def _self_contact(x, garment, material):
     return jnp.where(pairs.overflow, jnp.nan, value)
 
 
+def _counted(energy, moving):
+    """An energy that only a pose with a past has."""
+    return energy if moving is None else energy * moving
+
+
 def energies(
     x: Float[Array, "verts 3 *poses"],
     garment: Garment,
     material: Material,
-    frame: StepInputs,
+    step: StepInputs,
     terms: Terms,
     surface: Surface | None = None,
 ) -> dict[str, Float[Array, "*poses"]]:
-    """Every term of the total energy (10) by name, in J.
+    """Return every term of the total energy (10) by name, in J.
+
+        L = membrane + bending + collision + friction + gravity + pinning + own terms - f . x + inertia + self-contact
 
     Args:
         x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity, inertia and the "plane" collision.
-        garment, material: what is constant. frame: what this frame brings.
+        garment, material: what is constant. step: what this step brings, from `scene.step_inputs`.
         terms: which terms exist. surface: the touchable body, where there is collision.
 
     Self-contact is NaN where more pairs are near each other than its lists hold: an energy without some of them would be wrong.
     The target of inertia is a constant to the derivative: forces then balance mass times acceleration, as in implicit Euler;
-    but for `through_time`.
+    but for `through_time`. `elements.energies_and_gradient` is the fast path, equal to this one for every combination of terms.
+    Source: slides, equation (10).
     """
     mesh = garment.mesh
     mass = material.density * mesh.vertex_area
@@ -95,22 +104,30 @@ def energies(
             parts["bending"] = bending(x, mesh, material.bending)
     if terms.collision is not None:
         with jax.named_scope("collision"):
-            parts["collision"] = _collision(x, frame.body, surface, terms, material, frame.normals)
+            parts["collision"] = body_collision(x, step.body, surface, terms, material, step.normals)
     if terms.friction:
         with jax.named_scope("friction"):
-            parts["friction"] = friction(x, frame.carried, frame.pressed, material.friction, frame.dt)
+            value = friction(x, step.advected, step.lagged_normal_force, material.friction, step.dt)
+            parts["friction"] = _counted(value, step.moving)
     if terms.gravity:
         with jax.named_scope("gravity"):
             parts["gravity"] = gravity(x, mass, material.gravity)
-    if terms.inertia:
-        with jax.named_scope("inertia"):
-            target = project(frame.previous, frame.before)
-            target = target if terms.through_time else lax.stop_gradient(target)
-            parts["inertia"] = inertia(x, target, mass, frame.dt)
     if terms.pinning:
         with jax.named_scope("pinning"):
             pins = garment.pins
-            parts["pinning"] = pinning(unpose(frame.blended[pins], x[pins]), mesh.rest[pins], material.pinning)
+            unposed = unpose(step.vertex_transforms[pins], x[pins])
+            parts["pinning"] = pinning(unposed, mesh.rest[pins], material.pinning)
+    for term in terms.own:
+        with jax.named_scope(term.__name__):
+            parts[term.__name__] = term(x, step)
+    if step.force is not None:
+        with jax.named_scope("external"):
+            parts["external"] = -jnp.sum(step.force * x, axis=(0, 1))
+    if terms.inertia:
+        with jax.named_scope("inertia"):
+            target = project(step.previous, step.before)
+            target = target if terms.through_time else lax.stop_gradient(target)
+            parts["inertia"] = _counted(inertia(x, target, mass, step.dt), step.moving)
     if terms.self_contact:
         with jax.named_scope("self_contact"):
             parts["self_contact"] = _self_contact(x, garment, material)
@@ -118,5 +135,5 @@ def energies(
 
 
 def total(*arguments, **options) -> Float[Array, ""]:
-    """Total energy (10) in J: the sum of `energies`, called alike."""
+    """Return the total energy (10) in J: the sum of `energies`, called alike."""
     return sum(energies(*arguments, **options).values(), start=jnp.zeros(()))

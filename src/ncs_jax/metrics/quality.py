@@ -6,6 +6,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +20,17 @@ from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.pairs import Groups, groups_from
 from ncs_jax.energies.contact.surface import Surface, surface_from
+from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.membrane import deformation
-from ncs_jax.energies.terms import StepInputs
-from ncs_jax.energies.total import contact_force, distances, energies
+from ncs_jax.energies.total import distances
 from ncs_jax.geometry.mesh import corners
 from ncs_jax.geometry.numerics import angle_between, arctan2, norm
-from ncs_jax.geometry.skinning import blend, skin, unpose
+from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.geometry.soa_vectors import cross, dot, length
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.step_inputs import Past, step_inputs
 
 __all__ = ["QUANTITIES", "measure", "summarise"]
 
@@ -49,7 +51,7 @@ DEEPEST = 64  # points of a frame that are asked a second time whether they are 
 
 
 def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3 3"]) -> Float[Array, "points"]:
-    """How many times a surface encloses each point: 1 within a closed one, 0 outside; where it is open, by how much.
+    """Return how many times a surface encloses each point: 1 within a closed one, 0 outside; where it is open, by how much.
 
     The sum of the triangles' solid angles, w = sum_f 2 atan2(a . (b x c), |a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|) /
     (4 pi), with a, b, c from the point to the corners. Sources: van Oosterom and Strackee 1983; Jacobson et al. 2013.
@@ -61,9 +63,9 @@ def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3
 
 
 def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
-    """How deep points are inside, m, by exact point-triangle distance.
+    """Return how deep points are inside, m, by exact point-triangle distance.
 
-    Of a garment worn below, `layered`, a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
+    With garments worn below (`layered`) a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
     points inward. The deepest points are therefore asked a second time: only what it also encloses is inside.
     """
     index, _ = nearest_triangle(x, body, surface)
@@ -75,69 +77,93 @@ def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
     return depth.at[at].set(jnp.where(inside, deepest, -jnp.abs(deepest)))
 
 
-def _frame(
-    model: Model, exact: bool, groups: Groups | None, middles: Surface | None, x, previous, before, matrices, matrices_before
-) -> dict[str, Float[Array, ""]]:
+class _Frame(NamedTuple):
+    """One frame of an animation: the garment there and in the two frames before, m, and the joints there and before."""
+
+    x: Float[Array, "verts 3"]
+    previous: Float[Array, "verts 3"]
+    before: Float[Array, "verts 3"]
+    matrices: Float[Array, "joints 3 4"]
+    matrices_before: Float[Array, "joints 3 4"]
+
+    def seen_from_root(self) -> tuple[_Frame, Float[Array, "1 3"]]:
+        """Return the frame seen from the root joint, where single precision is finest, and where that is."""
+        origin = self.matrices[:1, :, 3]
+        x, previous, before = self.x - origin, self.previous - origin, self.before - origin
+        return _Frame(x, previous, before, *(m.at[:, :, 3].add(-origin) for m in self[3:])), origin
+
+
+class _Search(NamedTuple):
+    """What is looked for in every frame."""
+
+    exact: bool  # penetration by exact distance
+    groups: Groups | None  # triangles through each other
+    middles: Surface | None  # of edges, inside the body
+
+
+def _shape(model: Model, x) -> dict[str, Float[Array, ""]]:
+    """Strain, shear and folds of a garment."""
+    mesh = model.garment.mesh
+    strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+    warp, weft = (jnp.stack(w, axis=-1) for w in deformation(x, mesh))
+    shear = jnp.abs(angle_between(warp, weft) - np.pi / 2)
+    bend = angles(corners(x, mesh.hinges), mesh)
+    return {
+        "strain_mean": 100 * jnp.mean(strain),
+        "strain_p99": 100 * jnp.percentile(strain, 99),
+        "shear_mean": jnp.degrees(jnp.sum(mesh.face_area * shear) / jnp.sum(mesh.face_area)),
+        "hinge_mean": jnp.degrees(jnp.mean(jnp.abs(bend))),
+    }
+
+
+def _penetration(model: Model, search: _Search, x, body) -> dict[str, Float[Array, ""]]:
+    """How much of a garment is inside the body."""
+    mesh, layered = model.garment.mesh, bool(model.under)
+    if search.exact:
+        depth = _depth(x, body, model.surface, layered)
+    else:
+        depth = -distances(x, body, model.surface, model.terms)
+    result = {"penetrating": 100 * jnp.mean(depth > 0), "depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
+    if search.middles is not None:
+        between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
+        deepest = jnp.max(_depth(between, body, search.middles, layered))
+        result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
+    return result
+
+
+def _measure_frame(model: Model, search: _Search, frame: _Frame) -> dict[str, Float[Array, ""]]:
     mesh, terms = model.garment.mesh, model.terms
-    origin = matrices[:1, :, 3]  # seen from the root joint, where single precision is finest
-    x, previous, before = x - origin, previous - origin, before - origin
-    matrices, matrices_before = matrices.at[:, :, 3].add(-origin), matrices_before.at[:, :, 3].add(-origin)
-    body = None if model.body is None else pose_body(model, matrices)
-    blended = blend(matrices, model.blend) if terms.pinning else None
-    carried = pressed = None
+    frame, origin = frame.seen_from_root()
+    x, unposed = frame.x, None
     if terms.friction:
-        carried = skin(blend(matrices, model.blend), unpose(blend(matrices_before, model.blend), previous))
-        pressed = contact_force(carried, body, model.surface, terms, model.material)
-    frame = StepInputs(1 / model.fps, previous, before, body, blended, carried, pressed)
-
-    def value(x):
-        parts = energies(x, model.garment, model.material, frame, terms, model.surface)
-        return sum(parts.values()), parts
-
-    (total, parts), gradient = jax.value_and_grad(value, has_aux=True)(x)
+        unposed = unpose(blend(frame.matrices_before, model.blend), frame.previous)
+    step = step_inputs(model, frame.matrices, Past(frame.previous, frame.before, unposed))
+    parts, gradient, _ = energies_and_gradient(x, model.garment, model.material, step, terms, model.surface)
+    total = sum(parts.values(), start=jnp.zeros((), x.dtype))
     mass = model.material.density * mesh.vertex_area
     if terms.gravity:
         lifted = gravity(origin, jnp.sum(mass, keepdims=True), model.material.gravity)
         total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
     heavy = mass > 0
     square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
-    strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
-    warp, weft = (jnp.stack(w, axis=-1) for w in deformation(x, mesh))
-    shear = jnp.abs(angle_between(warp, weft) - np.pi / 2)
-    bend = angles(corners(x, mesh.hinges), mesh)
-    result = {
-        "total": total,
-        **parts,
-        "strain_mean": 100 * jnp.mean(strain),
-        "strain_p99": 100 * jnp.percentile(strain, 99),
-        "shear_mean": jnp.degrees(jnp.sum(mesh.face_area * shear) / jnp.sum(mesh.face_area)),
-        "hinge_mean": jnp.degrees(jnp.mean(jnp.abs(bend))),
-        "out_of_balance": jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81,
-    }
+    result = {"total": total, **parts, **_shape(model, x)}
+    result["out_of_balance"] = jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81
     if model.surface is not None:
-        if exact:
-            depth = _depth(x, body, model.surface, bool(model.under))
-        else:
-            depth = -distances(x, body, model.surface, terms)
-        result["penetrating"] = 100 * jnp.mean(depth > 0)
-        result["depth_max"] = 1000 * jnp.maximum(jnp.max(depth), 0)
-        if middles is not None:
-            between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
-            deepest = jnp.max(_depth(between, body, middles, bool(model.under)))
-            result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
-    if groups is not None:
-        through, overflow = intersecting(x, mesh, groups)
+        result |= _penetration(model, search, x, step.body if terms.collision else pose_body(model, frame.matrices))
+    if search.groups is not None:
+        through, overflow = intersecting(x, mesh, search.groups)
         result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
     return result
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _measure(model, exact, groups, middles, *frames):
-    return lax.map(lambda frame: _frame(model, exact, groups, middles, *frame), frames)
+    search = _Search(exact, groups, middles)
+    return lax.map(lambda frame: _measure_frame(model, search, _Frame(*frame)), frames)
 
 
 def _middles(model: Model) -> Surface:
-    """What the search for the nearest triangle knows of the middles of the edges."""
+    """Return what the search for the nearest triangle knows of the middles of the edges."""
     mesh = model.garment.mesh
     between = np.asarray((mesh.rest[mesh.edges[:, 0]] + mesh.rest[mesh.edges[:, 1]]) / 2)
     body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
@@ -159,7 +185,7 @@ def measure(
     exact: bool = True,
     self_contact: bool | None = None,
 ) -> dict[str, np.ndarray]:
-    """Every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
+    """Return every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
 
     Args:
         vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
@@ -194,5 +220,5 @@ def measure(
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
-    """Means over frames or motions; the largest for `depth_max` and `middle_depth_max`, the median for `out_of_balance`."""
+    """Return means over frames or motions; the largest of depths, the median of `out_of_balance`."""
     return {name: float(_SUMMARY.get(name, np.mean)(values)) for name, values in rows.items()}

@@ -13,12 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ncs_jax.geometry.skinning import Blend, blend, forward, skin, transforms
+from ncs_jax.geometry.skinning import Blend, forward, transforms
 from ncs_jax.network.methods.method import Method, decode, for_inference, garment_blend
 from ncs_jax.scene import descriptors
 from ncs_jax.scene.descriptors import Joints
 from ncs_jax.scene.features import MotionFeatures, input_joints
-from ncs_jax.scene.model import Model
+from ncs_jax.scene.model import Model, pose_garment
 
 __all__ = ["Rollout", "StreamState", "animate", "animated", "first_broken", "stepper"]
 
@@ -102,8 +102,7 @@ def _posed(model: Model, network: Method, params: dict, weights: Blend, matrices
 
     def some(args):
         matrices, codes = args
-        x = rest[..., None] + decode(network, params, model, *codes)
-        return skin(blend(jnp.moveaxis(matrices, 0, -1), weights), x)
+        return pose_garment(model, decode(network, params, model, *codes), jnp.moveaxis(matrices, 0, -1), weights)
 
     # Turned at the end, outside the map: XLA would skin in that order too, ten times slower.
     x = lax.map(some, jax.tree.map(lambda a: a[at], (matrices, codes)))

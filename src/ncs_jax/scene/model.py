@@ -16,7 +16,7 @@ from ncs_jax.energies.terms import Garment, Material, Terms
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
 
-__all__ = ["Model", "RitzModes", "local_rotations", "pose_body", "posed_bodies"]
+__all__ = ["Model", "RitzModes", "local_rotations", "pose_body", "pose_garment", "posed_bodies"]
 
 
 @jax.tree_util.register_dataclass
@@ -76,8 +76,25 @@ class Model:
     under: tuple[Layer, ...] = ()  # garments worn below this one
 
 
+def pose_garment(
+    model: Model,
+    offsets: Float[Array, "verts 3 *poses"],
+    matrices: Float[Array, "joints 3 4 *poses"],
+    weights: Blend | None = None,
+) -> Float[Array, "verts 3 *poses"]:
+    """Return the garment posed, equation (16): x = sum_j w_j (R_j (rest + offset) + t_j), m.
+
+    Args:
+        offsets: in unposed space, m. matrices: joint transforms. weights: skinning weights, where they are learned; else the
+            model's.
+    """
+    rest = model.garment.mesh.rest
+    rest = rest.reshape(rest.shape + (1,) * (offsets.ndim - 2))
+    return skin(blend(matrices, model.blend if weights is None else weights), rest + offsets)
+
+
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
-    """The touchable body in one frame or several, and the garments under this one, m."""
+    """Return the touchable body in one frame or several, and the garments under this one, m."""
     lanes = (1,) * (matrices.ndim - 3)
     body = skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + lanes))
     if not model.under:
@@ -87,7 +104,7 @@ def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Floa
 
 
 def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:
-    """Positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
+    """Return positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
     frames = len(matrices)
     at = np.minimum(np.arange(-(-frames // lanes) * lanes), frames - 1).reshape(-1, lanes)
 
@@ -101,6 +118,6 @@ def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lane
 
 @jax.jit
 def local_rotations(model: Model, poses: Float[Array, "*frames all 3"]) -> Float[Array, "*frames joints 3 3"]:
-    """Local rotation matrices, along the world's axes at rest, of the joints that matter, from axis-angle poses of all."""
+    """Return local rotation matrices of the joints that matter, along the axes at rest, from axis-angle poses of all."""
     local = axis_angle_to_matrix(poses[..., np.asarray(model.source_joints), :])
     return local if model.rest_rotations is None else to_rest_axes(local, model.rest_rotations)

@@ -9,7 +9,7 @@ no increase. Source: Baraff and Witkin 1998; Martin et al. 2011.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -19,15 +19,23 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ncs_jax.energies.contact.safe_steps import yielding
-from ncs_jax.energies.inertia import project
-from ncs_jax.energies.total import contact_force
-from ncs_jax.geometry.skinning import blend, forward, skin, transforms, unpose
+from ncs_jax.geometry.skinning import blend, forward, skin, unpose
+from ncs_jax.geometry.skinning import transforms as joint_transforms
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.model import Model
+from ncs_jax.scene.step_inputs import Past, step_inputs
 from ncs_jax.simulation.solver.cholesky import Elimination, elimination
 from ncs_jax.simulation.solver.equilibrium import equilibrium
 from ncs_jax.simulation.solver.minimise import Settings, Solution
-from ncs_jax.simulation.solver.problem import Problem, apart, knowing, look, placed, touched, unhindered
+from ncs_jax.simulation.solver.problem import (
+    Problem,
+    body_contact,
+    collision_free_step,
+    find_neighbours,
+    hold_pins,
+    share_outside_body,
+    with_neighbours,
+)
 from ncs_jax.simulation.solver.stiffness import Couplings, couplings_from
 
 APPROACH = 8  # safe steps towards where the next frame is sought,
@@ -73,15 +81,17 @@ def simulator_from(model: Model) -> Simulator:
     return Simulator(model, couplings, elimination(np.asarray(couplings.pairs), np.asarray(model.garment.mesh.rest)))
 
 
-def _expected(problem: Problem, state: SimulationState, carried, blended) -> Float[Array, "verts 3"]:
-    """Where a frame's search starts: the last frame goes on as it moves in unposed space, but through no limb, however fast."""
-    onward = skin(blended, 2 * state.unposed - state.unposed_before) - carried
-    start = carried + jnp.atleast_1d(unhindered(touched(problem, carried), onward))[:, None] * onward
-    return lax.stop_gradient(placed(problem, start))
+def _expected(problem: Problem, state: SimulationState, advected, transforms) -> Float[Array, "verts 3"]:
+    """Return where a frame's search starts: the last frame goes on as in unposed space, but through no limb, however fast."""
+    onward = skin(transforms, 2 * state.unposed - state.unposed_before) - advected
+    start = advected + jnp.atleast_1d(share_outside_body(body_contact(problem, advected), onward))[:, None] * onward
+    return lax.stop_gradient(hold_pins(problem, start))
 
 
 def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Array, "verts 3"]):
-    """As far from x to one target after the other as cloth comes without passing through itself; and the problem there.
+    """Go as far from x to one target after the other as cloth comes without passing through itself.
+
+    Returns the problem with what is near there, and the place.
 
     Cloth that would come too near to cloth gives way, all else goes on: what stays behind, a limb might go through.
     """
@@ -92,18 +102,20 @@ def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Ar
             return (t >= WORTH) & (t < 1) & (count < APPROACH)
 
         def go(state):
-            x, _, count, seen = state
-            way = yielding(x, target - x, seen[1])
-            t = apart(knowing(problem, seen), x, way)
+            x, _, count, neighbours = state
+            way = yielding(x, target - x, neighbours.pairs)
+            t = collision_free_step(with_neighbours(problem, neighbours), x, way)
             x = jnp.where(t < WORTH, x, x + t * way)
-            return x, t, count + 1, look(problem, x)
+            return x, t, count + 1, find_neighbours(problem, x)
 
-        x, seen = state
-        x, _, _, seen = lax.while_loop(unfinished, go, (x, jnp.full((), WORTH, x.dtype), jnp.zeros((), jnp.int32), seen))
-        return (x, seen), None
+        x, neighbours = state
+        x, _, _, neighbours = lax.while_loop(
+            unfinished, go, (x, jnp.full((), WORTH, x.dtype), jnp.zeros((), jnp.int32), neighbours)
+        )
+        return (x, neighbours), None
 
-    (x, seen), _ = lax.scan(approached, (x, look(problem, x)), jnp.stack(targets))
-    return knowing(problem, seen), placed(problem, x)
+    (x, neighbours), _ = lax.scan(approached, (x, find_neighbours(problem, x)), jnp.stack(targets))
+    return with_neighbours(problem, neighbours), hold_pins(problem, x)
 
 
 def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
@@ -116,6 +128,8 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
     """
     settings = settings or Settings()
     model = simulator.model
+    # The past carries a derivative here: that of a frame by the frames before.
+    model = replace(model, terms=replace(model.terms, inertia=True, through_time=True))
     rest = model.garment.mesh.rest
     dtype = rest.dtype
 
@@ -129,34 +143,27 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         # seen from the root joint: float32 tells places 5 m off no finer than 0.5 um, which in a pin of 1000 N/m is 1 mN
         origin = lax.stop_gradient(matrices[:1, :, 3])
         matrices = matrices.at[:, :, 3].add(-origin)
-        previous, earlier = state.previous - origin, state.before - origin
-        blended = blend(matrices, model.blend)
-        body = None if model.body is None or model.surface is None else pose_body(model, matrices)
+        transforms = blend(matrices, model.blend)
         moving = (state.started & settings.inertia).astype(dtype)
-        carried = skin(blended, state.unposed)
-        pressed = None
-        if model.terms.friction:
-            pressed = moving * contact_force(carried, body, model.surface, model.terms, model.material)
-        problem = Problem(
-            model, simulator.couplings, simulator.order, body, blended if model.terms.pinning else None,
-            project(previous, earlier), force, moving,
-            pinned=skin(blended, rest)[model.garment.pins] if settings.exact_pins and len(model.garment.pins) else None,
-            carried=carried if model.terms.friction else None,
-            pressed=pressed,
-        )  # fmt: skip
-        problem = knowing(problem, look(problem, carried))
-        start = _expected(problem, state, carried, blended)
+        past = Past(state.previous - origin, state.before - origin, state.unposed, moving)
+        step = step_inputs(model, matrices, past, transforms=transforms, force=force)
+        exact = settings.exact_pins and len(model.garment.pins) > 0
+        pinned = skin(transforms, rest)[model.garment.pins] if exact else None
+        problem = Problem(model, simulator.couplings, simulator.order, step, pinned)
+        advected = skin(transforms, state.unposed)
+        problem = with_neighbours(problem, find_neighbours(problem, advected))
+        start = _expected(problem, state, advected, transforms)
         if model.terms.self_contact:
-            last = jnp.where(state.started, placed(problem, previous), start)
-            problem, start = _approached(problem, *map(lax.stop_gradient, (last, carried, start)))
+            last = jnp.where(state.started, hold_pins(problem, past.previous), start)
+            problem, start = _approached(problem, *map(lax.stop_gradient, (last, advected, start)))
         x, solution = equilibrium(settings, problem, start)
-        unposed = unpose(blended, x)
+        unposed = unpose(transforms, x)
         x, first = x + origin, ~state.started
         before = (jnp.where(first, x, state.previous), jnp.where(first, unposed, state.unposed))
         return SimulationState(x, before[0], unposed, before[1], jnp.asarray(True), solution), x
 
     def step(state: SimulationState, rotations, translation, force=None):
-        return follow(state, transforms(model.skeleton, forward(model.skeleton, rotations, translation)), force)
+        return follow(state, joint_transforms(model.skeleton, forward(model.skeleton, rotations, translation)), force)
 
     return Simulation(init, step, follow)
 

@@ -1,4 +1,4 @@
-"""The vibrations of a garment about its drape: what a swing is made of."""
+"""Load-dependent Ritz vectors of a garment about its drape: the vibrations that a swing is made of."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, RitzModes, pose_body
-from ncs_jax.simulation.solver.problem import TALL, Problem, blocks, descended, evaluated, imbalance, knowing, look, static_step
+from ncs_jax.scene.model import Model, RitzModes
+from ncs_jax.scene.step_inputs import Past, step_inputs
+from ncs_jax.simulation.solver.problem import (
+    TALL,
+    Problem,
+    evaluate,
+    find_neighbours,
+    imbalance,
+    line_search,
+    static_step,
+    stiffness_blocks,
+    with_neighbours,
+)
 from ncs_jax.simulation.solver.stiffness import couplings_from
 
 __all__ = ["softest_ritz_modes"]
@@ -23,31 +35,27 @@ ENOUGH = {np.dtype(np.float32): 0.3, np.dtype(np.float64): 0.01}  # m/s^2: the a
 LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
-def _still(model: Model, track: MotionFeatures) -> Problem:
-    """The garment in a track's first frame, seen from the root joint, which no past moves."""
+def _still(model: Model, track: MotionFeatures) -> tuple[Problem, Array]:
+    """The garment in a track's first frame, seen from the root joint, which no past moves; and its skinning transforms."""
     matrices = track.matrices[0]
     matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
-    terms = replace(model.terms, inertia=False, friction=False, self_contact=False)
-    blended = blend(matrices, model.blend)
-    body = None if model.surface is None else pose_body(model, matrices)
-    rest = model.garment.mesh.rest
-    nothing = jnp.zeros((), rest.dtype)
-    couplings = couplings_from(model.garment.mesh)
-    return Problem(replace(model, terms=terms), couplings, None, body, blended, rest, None, nothing)
+    model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
+    transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
+    step = step_inputs(model, matrices, Past(rest, rest, moving=jnp.zeros((), rest.dtype)), transforms=transforms)
+    return Problem(model, couplings_from(model.garment.mesh), None, step), transforms
 
 
 @jax.jit
 def _evaluated(problem: Problem, x):
     """The problem that knows what is near, what is known of the place, and the blocks of its stiffness and a mass."""
-    problem = knowing(problem, look(problem, x))
-    point = evaluated(problem, x)
-    return problem, point, blocks(problem, x, point)
+    problem = with_neighbours(problem, find_neighbours(problem, x))
+    point = evaluate(problem, x)
+    return problem, point, stiffness_blocks(problem, x, point)
 
 
 @jax.jit
 def _descended(problem: Problem, x, point, p):
-    seen = None if problem.seen is None else (problem.near, problem.pairs, problem.seen)
-    x, *_, moved = descended(problem, seen, x, point, p)
+    x, *_, moved = line_search(problem, problem.neighbours, x, point, p)
     return x, moved
 
 
@@ -70,12 +78,12 @@ def _solved(matrix, right):
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
 
 
-def _drape(problem: Problem):
-    """The problem and the blocks at the static equilibrium x_0, found by Newton's method from cloth that is skinned.
+def _drape(problem: Problem, x):
+    """The problem and the blocks at the static equilibrium x_0, found by Newton's method from x.
 
-    What `simulator` does, on the host: that is slower a step, and has no factorisation of its own to compile.
+    What `implicit_euler` does, on the host: that is slower a step, and has no factorisation of its own to compile.
     """
-    x, mass = skin(problem.blended, problem.model.garment.mesh.rest), jnp.sum(problem.mass)
+    mass = jnp.sum(problem.mass)
     for _ in range(STEPS):
         near, point, found = _evaluated(problem, x)
         diagonal, off = (np.asarray(block, np.float64) for block in found)
@@ -89,10 +97,11 @@ def _drape(problem: Problem):
 
 
 def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
-    """The `count` softest vibrations of a garment among those that smooth inertia forces excite.
+    """Return the `count` softest vibrations of a garment among those that smooth inertia forces excite.
 
-    Such a force is a mass times a smooth mode b_j (`modes.modal_basis`) along an axis e_i. What it does to the drape x_0, the
-    static equilibrium in the first frame of a track, is a load-dependent Ritz vector u_ij; of those the vibrations are made:
+    Such a force is a mass times a smooth mode b_j (`laplacian_modes.modal_basis`) along an axis e_i. What it does to the drape
+    x_0, the static equilibrium in the first frame of a track, is a load-dependent Ritz vector u_ij. The vibrations are made of
+    those:
 
         (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
 
@@ -108,7 +117,8 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     from scipy.linalg import eigh
     from scipy.sparse import diags
 
-    problem, diagonal, off = _drape(_still(model, track))
+    problem, transforms = _still(model, track)
+    problem, diagonal, off = _drape(problem, skin(transforms, model.garment.mesh.rest))
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
     added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
@@ -127,7 +137,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(squares))] < 0, -1, 1)
     energy = AMPLITUDE**2 * mass.sum() * squares[0]
     directions = np.linalg.solve(
-        np.asarray(problem.blended, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
+        np.asarray(transforms, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
     )
     dtype = model.basis.dtype
     return RitzModes(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype))

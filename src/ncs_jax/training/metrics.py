@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.total import distances
 from ncs_jax.geometry.numerics import norm
-from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.network.methods.method import Method, decode, garment_blend
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.model import Model, pose_body, pose_garment
 from ncs_jax.training.loss import physics
 from ncs_jax.training.step import Fault
 
@@ -36,7 +35,7 @@ def training_metrics(
 
     def one(args):
         offset, matrices = args
-        x = skin(blend(matrices, weights), mesh.rest + offset)
+        x = pose_garment(model, offset, matrices, weights)
         length = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
         strain = jnp.abs(length / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
         result = {"strain": 100 * jnp.mean(strain)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +14,13 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, Int
 
-from ncs_jax.network.methods.method import Method, initial_parameters
+from ncs_jax.network.methods.method import Method, Windows, initial_parameters
+from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import TrainingSpec
 from ncs_jax.training.loss import gradients
 
-__all__ = ["Fault", "TrainState", "chunk_runner", "initial_state", "step_size"]
+__all__ = ["Fault", "Task", "TrainState", "chunk_runner", "initial_state", "step_size", "windows_of"]
 
 
 @jax.tree_util.register_dataclass
@@ -70,12 +72,36 @@ def _sample(share, index, axis: str | None):
     return lax.psum(jnp.where(lax.axis_index(axis) == index // size, share[..., index % size], 0), axis)
 
 
-def step(model, network, spec, steps, state: TrainState, track, ends, pairs, axis=None) -> tuple[TrainState, dict]:
-    """One optimiser step; a step with any number that is not finite leaves the weights as they were and is counted.
+class Task(NamedTuple):
+    """What is trained, and how: constant over a training."""
 
-    Within a `shard_map` over `axis`, `ends` and `pairs` are this device's share of the batch and the rest is every device's.
+    model: Model
+    network: Method
+    spec: TrainingSpec
+    axis: str | None = None  # of the devices that share the batch, within a `shard_map` over it
+
+
+def windows_of(task: Task, ends, pairs) -> Windows:
+    """Return the windows of a step that end at frames `ends`, augmented by those that `pairs` names, both (batch,)."""
+    spec, axis = task.spec, task.axis
+    history = 3 if task.network.loss(task.model.terms).inertia else 1
+    augmented = round(spec.motion_augmentation * spec.batch) if task.network.controlled else 0
+    number = jnp.arange(ends.shape[0], dtype=ends.dtype)
+    if axis is not None:
+        number = number + lax.axis_index(axis) * ends.shape[0]
+    return Windows(ends, pairs, number, augmented, spec.window, history, axis)
+
+
+def step(task: Task, steps, state: TrainState, track: MotionFeatures, indices) -> tuple[TrainState, dict]:
+    """Take one optimiser step; one with any number that is not finite leaves the weights as they were and is counted.
+
+    Args:
+        steps: how many the training has. indices: (ends, pairs) of the batch, see `windows_of`.
+
+    Within a `shard_map` they are this device's share of the batch and the rest is every device's.
     """
-    grads, parts, (g, offsets) = gradients(model, network, spec, state.params, track, ends, pairs, axis)
+    (ends, _), axis = indices, task.axis
+    grads, parts, (g, offsets) = gradients(task.model, task.network, state.params, track, windows_of(task, *indices))
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
     if axis is not None:
         sample_good = lax.all_gather(sample_good, axis, tiled=True)
@@ -90,7 +116,7 @@ def step(model, network, spec, steps, state: TrainState, track, ends, pairs, axi
     opt = lax.optimization_barrier(choose(ADAM.update(grads, state.optimiser)[1], state.optimiser))
     count = jnp.maximum(opt.count, 1)
     mean, square = optax.tree.bias_correction(opt.mu, BETAS[0], count), optax.tree.bias_correction(opt.nu, BETAS[1], count)
-    size = step_size(spec, state.step, steps)
+    size = step_size(task.spec, state.step, steps)
     params = jax.tree.map(lambda p, m, v: jnp.where(good, p - size * m / (jnp.sqrt(v) + 1e-8), p), state.params, mean, square)
 
     def first_bad():
@@ -115,7 +141,7 @@ def chunk_runner(network: Method, spec: TrainingSpec, mesh: Mesh | None = None):
 
     def run(state, ends, pairs, steps, model, track):
         def body(state, indices):
-            return step(model, network, spec, steps, state, track, *indices, axis)
+            return step(Task(model, network, spec, axis), steps, state, track, indices)
 
         return lax.scan(body, state, (ends, pairs))
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
@@ -16,7 +17,20 @@ from ncs_jax.scene.descriptors import DESCRIPTORS
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
-__all__ = ["Codes", "Method", "decode", "descriptor_sizes", "for_inference", "garment_blend", "initial_parameters"]
+__all__ = [
+    "Codes",
+    "Kept",
+    "Method",
+    "Offsets",
+    "Windows",
+    "decode",
+    "descriptor_sizes",
+    "for_inference",
+    "garment_blend",
+    "initial_parameters",
+    "no_coupling",
+    "window_offsets",
+]
 
 
 class Codes(NamedTuple):
@@ -33,6 +47,41 @@ class Codes(NamedTuple):
     def swung(self, alpha: float | Array | None = 1.0) -> Array | None:
         """alpha q; None leaves it out."""
         return None if self.swing is None or alpha is None else alpha * self.swing
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of one optimiser step, within its trace.
+
+    ends: last frames (batch,). others: which window of the whole batch moves an augmented one (batch,). number: each window's
+    place in the whole batch. augmented: so many of the whole batch, the first ones, are moved by another window (motion
+    augmentation). length: frames that a window looks back at. history: frames that inertia needs, 3, or 1 without it.
+    axis: of the devices that share the batch, None on one.
+    """
+
+    ends: Int[Array, "batch"]
+    others: Int[Array, "batch"]
+    number: Int[Array, "batch"]
+    augmented: int
+    length: int
+    history: int
+    axis: str | None = None
+
+    @property
+    def own(self) -> Array:
+        """Which windows move by themselves."""
+        return self.number >= self.augmented
+
+
+class Kept(NamedTuple):
+    """What a step knows of its windows beside what it differentiates."""
+
+    codes: Array  # z of the last `history` frames (history, batch, code)
+    swing: Array | None = None  # q of the last frames (batch, modes)
+
+
+Offsets = tuple[list[Array], Array | None]
+"""Offsets (verts, 3, batch) of frames, the last first, and one more array (verts, 3, batch) that a method's coupling reads."""
 
 
 @runtime_checkable
@@ -73,6 +122,12 @@ class Method(Protocol):
 
     def loss(self, terms: Terms) -> Terms:
         """Of a scene's terms those that train it, and whether inertia's target carries a gradient."""
+
+    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return what one step of training differentiates, and what it keeps constant; see `window_offsets`."""
+
+    def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
+        """Return energies (batch,) in J beyond the scene's terms, by name, and their gradient by the extra array, N."""
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """Of every frame (frames, code) of one motion, from rest at its start."""
@@ -118,6 +173,39 @@ def decode(
     if swing is None:
         return offsets
     return offsets + jnp.tensordot(model.vibrations.directions, swing, (-1, -1))
+
+
+def window_offsets(
+    network: Method, params: dict, model: Model, track: MotionFeatures, windows: Windows
+) -> tuple[Offsets, Kept]:
+    """Return the offsets of windows whose codes come from `network.windows`: those that the loss differentiates.
+
+    With motion augmentation the first windows take another one's dynamic code on their static code, both constants.
+    """
+    history = windows.history
+    z_static, z_dynamic, _ = network.windows(params, track, windows.ends, max(windows.length, history), history)
+    augmented = windows.augmented
+    if z_dynamic is None:
+        z = z_static
+    elif not augmented:
+        z = z_static + z_dynamic
+    elif windows.axis is not None:  # any number of this device's windows are such, and the others' codes may be elsewhere
+        everyone = lax.all_gather(lax.stop_gradient(z_dynamic), windows.axis, axis=1, tiled=True)
+        mixed = lax.stop_gradient(z_static) + everyone[:, windows.others]
+        z = jnp.where(windows.own[:, None], z_static + z_dynamic, mixed)
+    else:
+        others = windows.others[:augmented]
+        mixed = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, others])
+        z = jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
+    if not model.terms.through_time:
+        return ([decode(network, params, model, z[-1])], None), Kept(z)
+    every = decode(network, params, model, z)
+    return ([every[:, :, k] for k in (2, 1, 0)], None), Kept(z)
+
+
+def no_coupling(model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
+    """Return no energy: for methods whose offsets have no extra array."""
+    return {}, jnp.zeros_like(extra)
 
 
 def for_inference(network: Any, params: dict, model: Model) -> tuple[Any, dict]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder, StaticEncoder
-from ncs_jax.network.methods.method import Codes, descriptor_sizes
+from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -66,6 +66,12 @@ class NCS:
         features = self.dynamic.apply(variables, dynamic, method="features")
         state = jnp.asarray(self.dynamic.apply(variables, state, features, method="step"))
         return state, Codes(fixed, state)
+
+    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return the offsets of windows from their codes."""
+        return window_offsets(self, params, model, track, windows)
+
+    coupling = staticmethod(no_coupling)
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """z_S of every frame by itself, and z_D from rest at the motion's start."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import StaticEncoder
-from ncs_jax.network.methods.method import Codes, descriptor_sizes
+from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -46,6 +46,12 @@ class PBNS:
     def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
         """The code of the frame's pose; nothing is carried."""
         return state, self._of(params, static)
+
+    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return the offsets of windows from their codes."""
+        return window_offsets(self, params, model, track, windows)
+
+    coupling = staticmethod(no_coupling)
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """Of every frame by itself."""

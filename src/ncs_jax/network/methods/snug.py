@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import DynamicEncoder
-from ncs_jax.network.methods.method import Codes, descriptor_sizes
+from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -56,6 +56,12 @@ class SNUG:
         features = self.recurrent.apply(variables, self._read(static, dynamic), method="features")
         state = jnp.asarray(self.recurrent.apply(variables, state, features, method="step"))
         return state, Codes(state)
+
+    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return the offsets of windows from their codes."""
+        return window_offsets(self, params, model, track, windows)
+
+    coupling = staticmethod(no_coupling)
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """From a state of zero at the motion's start."""

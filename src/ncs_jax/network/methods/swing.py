@@ -24,12 +24,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.geometry.skinning import blend
 from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import StaticEncoder, SwingEncoder
-from ncs_jax.network.methods.method import Codes, decode, descriptor_sizes, garment_blend
+from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, decode, descriptor_sizes, garment_blend
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model
+from ncs_jax.scene.model import Model, pose_garment
 
 __all__ = ["Swing"]
 
@@ -139,12 +139,29 @@ class Swing:
         q = track.swing[back]
         return Codes(self._static(params, track.static[back]), self._dynamic(params, q), q)
 
-    def mixed(
-        self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], others: Int[Array, "batch"], share
-    ) -> Codes:
-        """Of frames with the swings of other frames, so much of them."""
-        q = share[:, None] * track.swing[others]
-        return Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
+    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return offsets of the last frames with a swing, and what they are beyond the static ones.
+
+        The swing is the frame's own, or with motion augmentation any size of another frame's.
+        """
+        ends, others = windows.ends, windows.ends
+        if windows.axis is not None:
+            others = lax.all_gather(ends, windows.axis, tiled=True)
+        at = jnp.where(windows.own, ends, others[windows.others])
+        share = windows.number.astype(track.swing.dtype) / max(windows.augmented - 1, 1)
+        share = jnp.where(windows.own, 1, share * self.enlargement(track, at))
+        q = share[:, None] * track.swing[at]
+        codes = Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
+        z = codes.together()
+        offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
+        offsets, static = jnp.split(offsets, 2, axis=-1)
+        moved = offsets - lax.stop_gradient(static)
+        return ([offsets + jnp.tensordot(model.vibrations.directions, q, (-1, -1))], moved), Kept(z[None], q)
+
+    def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
+        """Return the energy `hold` of what the dynamic code adds to the offsets, and its derivative."""
+        value, gradient = self.hold(model, extra, kept.swing)
+        return {"hold": value}, gradient
 
     def enlargement(self, track: MotionFeatures, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
         """By how much the swings q of frames, enlarged, have the energy E_0 |q|^2 / 2 of the track's largest.
@@ -178,11 +195,12 @@ class Swing:
 
     def _static_garment(self, params, model, z, matrices):
         """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
-        blended = blend(matrices, garment_blend(self, params, model))
+        weights = garment_blend(self, params, model)
+        transforms = blend(matrices, weights)
         offsets = decode(self, params, model, z)
         directions = model.vibrations.directions
-        p = sum(blended[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
-        return skin(blended, model.garment.mesh.rest[..., None] + offsets), p
+        p = sum(transforms[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
+        return pose_garment(model, offsets, matrices, weights), p
 
     def _stiff(self, model, g):
         """G (1 + c h) + h^2 E_0, poses last."""

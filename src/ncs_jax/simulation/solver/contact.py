@@ -14,7 +14,7 @@ from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.terms import Material, Terms
 from ncs_jax.energies.total import distances
 
-__all__ = ["Contact", "touching"]
+__all__ = ["Contact", "evaluate_contact"]
 
 
 class Contact(NamedTuple):
@@ -26,7 +26,7 @@ class Contact(NamedTuple):
     distance: Float[Array, "verts"]  # m
 
 
-def touching(
+def evaluate_contact(
     x: Float[Array, "verts 3"],
     body: Float[Array, "body 3"],
     surface: Surface,
@@ -35,7 +35,7 @@ def touching(
     near: Quadrics | None = None,
     only: Int[Array, "some"] | None = None,
 ) -> Contact:
-    """Contact of all vertices, each of which touches the body by itself.
+    """Return the contact of all vertices, each of which touches the body by itself.
 
     Args:
         x, body: positions in m. near: the body near the garment, where contact is smooth and it is known already.

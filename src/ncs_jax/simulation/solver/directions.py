@@ -19,7 +19,7 @@ from jax import lax
 from ncs_jax.energies.contact import self_contact
 from ncs_jax.simulation.solver.cholesky import Factor, factorise, solve
 from ncs_jax.simulation.solver.conjugate_gradients import conjugate_gradients
-from ncs_jax.simulation.solver.problem import blocks, dot
+from ncs_jax.simulation.solver.problem import dot, stiffness_blocks
 from ncs_jax.simulation.solver.stiffness import multiply
 
 __all__ = ["DIRECTIONS", "Direction"]
@@ -43,7 +43,7 @@ def _newton(problem, x, point, memory):
 
     Cloth that touches itself couples vertices that no element does: then the rest of the matrix preconditions the whole.
     """
-    diagonal, off = blocks(problem, x, point._replace(folds=None))
+    diagonal, off = stiffness_blocks(problem, x, point._replace(folds=None))
     if point.folds is None:
         return -solve(problem.order, factorise(problem.order, diagonal, off), point.gradient), memory
     stiff = problem.model.material.self_contact
@@ -75,7 +75,9 @@ def _fresh(problem, x, point) -> _Memory:
     that, does not know which way the cloth lay when the frame began, so it stays good while the cloth turns.
     """
     none = jnp.zeros((MEMORY, *x.shape), x.dtype)
-    traces = [jnp.trace(b, axis1=1, axis2=2)[:, None, None] for b in blocks(problem, problem.model.garment.mesh.rest, point)]
+    traces = [
+        jnp.trace(b, axis1=1, axis2=2)[:, None, None] for b in stiffness_blocks(problem, problem.model.garment.mesh.rest, point)
+    ]
     factor = factorise(problem.order, *traces)
     return _Memory(factor, none, none, jnp.zeros(MEMORY, x.dtype), jnp.zeros((), jnp.int32), x, point.gradient)
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ncs_jax.simulation.solver.cholesky import solve
 from ncs_jax.simulation.solver.minimal_residuals import minimal_residuals
 from ncs_jax.simulation.solver.minimise import Settings, Solution, minimise
-from ncs_jax.simulation.solver.problem import Problem, energy, evaluated, factored, placed
+from ncs_jax.simulation.solver.problem import Problem, energy, evaluate, factor_stiffness, hold_pins
 
 __all__ = ["equilibrium"]
 
@@ -59,11 +59,11 @@ def _implicit_backward(static, kept, cotangents):
 
     def balance(numbers, x):
         problem = _joined(static, numbers, topology)
-        x = placed(problem, x)
+        x = hold_pins(problem, x)
         return jax.grad(energy, argnums=1)(problem, x) * free[:, None], x
 
     _, hessian = jax.linearize(lambda x: balance(numbers, x)[0], x)
-    factor = factored(problem, x, evaluated(problem, x))
+    factor = factor_stiffness(problem, x, evaluate(problem, x))
     tolerance = 1e-6 if x.dtype == jnp.float32 else 1e-12  # nearly the rounding
     right = along * free[:, None]
     adjoint, left = minimal_residuals(hessian, lambda r: solve(problem.order, factor, r), right, tolerance, 1000)

@@ -14,15 +14,15 @@ from ncs_jax.simulation.solver.directions import DIRECTIONS
 from ncs_jax.simulation.solver.patch import SIZE, Patch, pairs_of, patch_around, solve_dense
 from ncs_jax.simulation.solver.problem import (
     Problem,
-    blocks,
-    come,
-    descended,
-    evaluated,
+    evaluate,
+    find_neighbours,
     imbalance,
-    knowing,
-    look,
-    looked,
-    trusted,
+    line_search,
+    max_displacement,
+    refresh_neighbours,
+    stiffness_blocks,
+    trust_radius,
+    with_neighbours,
 )
 
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Solution", "minimise"]
@@ -61,23 +61,25 @@ class Solution:
 
 
 def _on_patch(problem: Problem, patch: Patch) -> Problem:
-    """The same frame seen by a patch alone."""
-    only = None if problem.near is None and problem.pairs is None else patch.verts
-    pairs = None if problem.pairs is None else pairs_of(patch, problem.pairs)
-    return replace(problem, model=patch.model, couplings=patch.couplings, only=only, pairs=pairs)
+    """Return the problem of a patch alone."""
+    near, only = problem.neighbours, None
+    if near is not None:
+        only = patch.verts
+        near = near if near.pairs is None else near._replace(pairs=pairs_of(patch, near.pairs))
+    return replace(problem, model=patch.model, couplings=patch.couplings, only=only, neighbours=near)
 
 
-def relaxed(problem: Problem, x: Float[Array, "verts 3"], seen, left: Float[Array, "verts"], tolerance):
-    """Positions after the patch of the greatest imbalance has found its own equilibrium, if it holds most of what is left.
+def relax_patch(problem: Problem, x: Float[Array, "verts 3"], neighbours, left: Float[Array, "verts"], tolerance):
+    """Return positions after the patch of the greatest imbalance came to its own equilibrium, if it holds most of what is left.
 
-    seen: from `look`, if anything. left: squared imbalances over mass, of which the patch shall keep no more than a quarter of
-    `tolerance`. Returns also what was seen last, and how many steps the patch took.
+    neighbours: from `find_neighbours`. left: squared imbalances over mass, of which the patch shall keep no more than a quarter
+    of `tolerance`. Returns also the neighbours found last, and how many steps the patch took.
     """
     patch = patch_around(left, problem.model, problem.couplings)
     moves = patch.place < SIZE
 
-    def local(seen):
-        return _on_patch(knowing(problem, seen), patch)
+    def local(neighbours):
+        return _on_patch(with_neighbours(problem, neighbours), patch)
 
     def unfinished(state):
         _, point, _, count, moved = state
@@ -85,71 +87,75 @@ def relaxed(problem: Problem, x: Float[Array, "verts 3"], seen, left: Float[Arra
         return moved & (count < LOCAL) & (kept > 0.25 * tolerance)
 
     def iterate(state):
-        x, point, seen, count, _ = state
-        here, springs = local(seen), None
+        x, point, neighbours, count, _ = state
+        here, springs = local(neighbours), None
         if point.folds is not None:
             v = self_contact.springs(point.folds, problem.model.material.self_contact)
             springs = point.folds.vertices, v if problem.free is None else v * problem.free[point.folds.vertices][..., None]
-        p = -solve_dense(patch, *blocks(here, x, point._replace(folds=None)), point.gradient, springs)
-        x, point, _, moved = descended(here, None, x, point, p)
-        if problem.pairs is not None:
+        p = -solve_dense(patch, *stiffness_blocks(here, x, point._replace(folds=None)), point.gradient, springs)
+        x, point, _, moved = line_search(here, None, x, point, p)
+        if problem.model.terms.self_contact:
 
             def again():
-                seen = look(problem, x)
-                return evaluated(local(seen), x), seen
+                neighbours = find_neighbours(problem, x)
+                return evaluate(local(neighbours), x), neighbours
 
-            point, seen = lax.cond(come(x, seen[-1]) > trusted(problem, x) / 2, again, lambda: (point, seen))
-        return x, point, seen, count + 1, moved
+            point, neighbours = lax.cond(
+                max_displacement(x, neighbours.found_at) > trust_radius(problem, x) / 2, again, lambda: (point, neighbours)
+            )
+        return x, point, neighbours, count + 1, moved
 
     worth = patch.whole & (jnp.sum(jnp.where(moves, left, 0)) > SHARE * jnp.sum(left))
-    state = (x, evaluated(local(seen), x), seen, jnp.zeros((), jnp.int32), worth)
-    x, _, seen, count, _ = lax.while_loop(unfinished, iterate, state)
-    return x, seen, count
+    state = (x, evaluate(local(neighbours), x), neighbours, jnp.zeros((), jnp.int32), worth)
+    x, _, neighbours, count, _ = lax.while_loop(unfinished, iterate, state)
+    return x, neighbours, count
 
 
 def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
-    """Positions that minimise the energy, found from `start`."""
+    """Return positions that minimise the energy, found from `start`, and how the solve went."""
     direction = DIRECTIONS[settings.solver]
     mass = jnp.sum(problem.mass)
     tolerance = settings.tolerance
     if tolerance is None:
         tolerance = 0.1 if start.dtype == jnp.float32 else 0.001
-    limit = jnp.where(problem.moving > 0, settings.iterations, settings.first)
+    limit = jnp.where(problem.step.moving > 0, settings.iterations, settings.first)
 
     def unfinished(state):
         *_, status, _, iteration = state
         return (status < 0) & (iteration < limit)
 
     def iterate(state):
-        x, point, memory, seen, _, _, iteration = state
-        p, memory = direction.along(knowing(problem, seen), x, point, memory)
-        x, point, seen, moved = descended(problem, seen, x, point, p)
+        x, point, memory, neighbours, _, _, iteration = state
+        p, memory = direction.along(with_neighbours(problem, neighbours), x, point, memory)
+        x, point, neighbours, moved = line_search(problem, neighbours, x, point, p)
         status, left = judged(point, ~moved, p)
         if direction.patches and x.shape[0] > 4 * SIZE:
 
-            def relax(x, point, seen):
+            def relax(x, point, neighbours):
                 enough = mass * (tolerance * STANDARD_GRAVITY) ** 2
-                x, seen, count = relaxed(problem, x, seen, imbalance(problem, point.gradient), enough)
-                point = lax.cond(count > 0, lambda: evaluated(knowing(problem, seen), x), lambda: point)
-                return x, point, seen, *judged(point, False, x)
+                x, neighbours, count = relax_patch(problem, x, neighbours, imbalance(problem, point.gradient), enough)
+                point = lax.cond(count > 0, lambda: evaluate(with_neighbours(problem, neighbours), x), lambda: point)
+                return x, point, neighbours, *judged(point, False, x)
 
-            x, point, seen, status, left = lax.cond(status < 0, relax, lambda *same: (*same, status, left), x, point, seen)
-        point, seen, status, left = looked_again(x, point, seen, status, left)
-        return x, point, memory, seen, status, left, iteration + 1
+            x, point, neighbours, status, left = lax.cond(
+                status < 0, relax, lambda *same: (*same, status, left), x, point, neighbours
+            )
+        point, neighbours, status, left = again_if_far(x, point, neighbours, status, left)
+        return x, point, memory, neighbours, status, left, iteration + 1
 
-    def looked_again(x, point, seen, status, left):
-        """With what is near found anew before that can no longer be trusted, and in any case before the frame is done."""
-        if seen is None:
-            return point, seen, status, left
+    def again_if_far(x, point, neighbours, status, left):
+        """Find what is near anew before it can no longer be trusted, and in any case before the frame is done."""
+        if neighbours is None:
+            return point, neighbours, status, left
 
         def again():
-            seen = look(problem, x)
-            point = evaluated(knowing(problem, seen), x)
-            return point, seen, *judged(point, False, x)
+            neighbours = find_neighbours(problem, x)
+            point = evaluate(with_neighbours(problem, neighbours), x)
+            return point, neighbours, *judged(point, False, x)
 
         done = (status == CONVERGED) | (status == STALLED)
-        far = jnp.where(done, 0, trusted(problem, x) / 2)
-        return lax.cond(come(x, seen[-1]) > far, again, lambda: (point, seen, status, left))
+        far = jnp.where(done, 0, trust_radius(problem, x) / 2)
+        return lax.cond(max_displacement(x, neighbours.found_at) > far, again, lambda: (point, neighbours, status, left))
 
     def judged(point, stuck, p):
         left = jnp.sqrt(jnp.sum(imbalance(problem, point.gradient)) / mass) / STANDARD_GRAVITY
@@ -157,12 +163,12 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left
 
-    seen = None if problem.seen is None else looked(problem, start, (problem.near, problem.pairs, problem.seen))
-    point = evaluated(knowing(problem, seen), start)
+    neighbours = refresh_neighbours(problem, start, problem.neighbours)
+    point = evaluate(with_neighbours(problem, neighbours), start)
     status, left = judged(point, False, start)
-    if seen is not None:  # as `looked_again` would, but without a program of its own: one step is taken in any case
-        status = jnp.where((status == CONVERGED) & (come(start, seen[-1]) > 0), -1, status)
-    memory = direction.begin(knowing(problem, seen), start, point)
-    state = (start, point, memory, seen, status, left, jnp.zeros((), jnp.int32))
+    if neighbours is not None:  # as `again_if_far` would, but without a program of its own: one step is taken in any case
+        status = jnp.where((status == CONVERGED) & (max_displacement(start, neighbours.found_at) > 0), -1, status)
+    memory = direction.begin(with_neighbours(problem, neighbours), start, point)
+    state = (start, point, memory, neighbours, status, left, jnp.zeros((), jnp.int32))
     x, *_, status, left, iterations = lax.while_loop(unfinished, iterate, state)
     return x, Solution(iterations, left, jnp.where(status < 0, LIMIT, status))

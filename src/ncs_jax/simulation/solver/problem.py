@@ -16,23 +16,52 @@ from ncs_jax.energies.contact.pairs import Pairs, nearby_pairs
 from ncs_jax.energies.contact.safe_steps import free_share, swept_share
 from ncs_jax.energies.contact.self_contact import Repulsion, repulsion
 from ncs_jax.energies.contact.smooth import Quadrics, nearby_quadrics
-from ncs_jax.energies.inertia import inertia
-from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.elements import energies_and_gradient
+from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import energies
 from ncs_jax.scene.model import Model
 from ncs_jax.simulation.solver.cholesky import Elimination, factorise
-from ncs_jax.simulation.solver.contact import Contact, touching
+from ncs_jax.simulation.solver.contact import Contact, evaluate_contact
 from ncs_jax.simulation.solver.stiffness import Couplings, stiffness
 
-__all__ = ["TALL", "Point", "Problem", "apart", "blocks", "come", "descended", "dot", "energy", "evaluated", "factored",
-           "imbalance", "knowing", "look", "looked", "placed", "reach", "static_step", "touched", "trusted",
-           "unhindered"]  # fmt: skip
+__all__ = [
+    "TALL",
+    "Neighbours",
+    "Point",
+    "Problem",
+    "body_contact",
+    "collision_free_step",
+    "dot",
+    "energy",
+    "evaluate",
+    "factor_stiffness",
+    "find_neighbours",
+    "hold_pins",
+    "imbalance",
+    "line_search",
+    "max_displacement",
+    "refresh_neighbours",
+    "search_radius",
+    "share_outside_body",
+    "static_step",
+    "stiffness_blocks",
+    "trust_radius",
+    "with_neighbours",
+]
 
 CLEARANCE = 0.01  # m: how far past the body's surface one iteration may carry a vertex, which contact then still pushes out
 STATIC = 1 / 30  # s: the time step that damps the way to a static state, where the frame's own is shorter,
 TALL = 2.0  # m: of garments up to this size; beyond, it grows with the root of the size, as a pendulum's period
 LEAST_STEP = 1e-6  # of a step: below it the line search gives up
 REACH = 2  # how far the search for self-contact looks, in thicknesses of the cloth
+
+
+class Neighbours(NamedTuple):
+    """What is near the garment where it was looked for."""
+
+    quadrics: Quadrics | None  # the body near the garment, where contact is smooth
+    pairs: Pairs | None  # cloth near cloth, where the garment touches itself
+    found_at: Float[Array, "verts 3"]  # the positions then, m
 
 
 @jax.tree_util.register_dataclass
@@ -43,23 +72,16 @@ class Problem:
     model: Model
     couplings: Couplings
     order: Elimination
-    body: Float[Array, "body 3"] | None  # posed
-    blended: Float[Array, "verts 3 4"] | None  # skinning transforms of the garment, where it is pinned
-    target: Float[Array, "verts 3"]  # where the vertices go without forces
-    force: Float[Array, "verts 3"] | None  # external, N
-    moving: Float[Array, ""]  # 0: inertia is left out, the frame is static
+    step: StepInputs  # its `moving` is 0 where inertia is left out, and the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
-    near: Quadrics | None = None  # the body near the garment, where contact is smooth,
-    pairs: Pairs | None = None  # of cloth near cloth, where it touches itself,
-    seen: Float[Array, "verts 3"] | None = None  # as both were found from here
-    carried: Float[Array, "verts 3"] | None = None  # see `Frame`, where there is friction
-    pressed: Float[Array, "verts 3"] | None = None
+    neighbours: Neighbours | None = None
     only: Int[Array, "some"] | None = None  # the vertices that move, if not all
 
     @property
-    def frame(self) -> StepInputs:
-        """What it brings to the energies."""
-        return StepInputs(1 / self.model.fps, body=self.body, blended=self.blended, carried=self.carried, pressed=self.pressed)
+    def terms(self) -> Terms:
+        """Those that are minimised: pins that are held exactly are none."""
+        terms = self.model.terms
+        return replace(terms, pinning=terms.pinning and self.pinned is None)
 
     @property
     def mass(self) -> Float[Array, "verts"]:
@@ -69,7 +91,7 @@ class Problem:
     @property
     def free(self) -> Bool[Array, "verts"] | None:
         """Which vertices no exact pin holds; None: all."""
-        return None if self.pinned is None else jnp.ones(self.target.shape[0], bool).at[self.model.garment.pins].set(False)
+        return None if self.pinned is None else jnp.ones(self.mass.shape, bool).at[self.model.garment.pins].set(False)
 
 
 class Point(NamedTuple):
@@ -82,88 +104,88 @@ class Point(NamedTuple):
 
 
 def dot(a, b):
-    """Inner product of two fields."""
+    """Return the inner product of two fields."""
     return jnp.sum(a * b)
 
 
-def energy(problem: Problem, x: Float[Array, "verts 3"], **without) -> Float[Array, ""]:
-    """What a frame minimises, J; perhaps without some of its terms."""
+def energy(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """Return what a frame minimises, J."""
     model = problem.model
-    held = model.terms.pinning and problem.pinned is None
-    terms = replace(model.terms, **{"inertia": False, "pinning": held, **without})
-    parts = energies(x, model.garment, model.material, problem.frame, terms, model.surface)
-    value = sum(parts.values(), start=jnp.zeros((), x.dtype))
-    if problem.force is not None:
-        value = value - dot(problem.force, x)
-    return value + problem.moving * inertia(x, problem.target, problem.mass, problem.frame.dt)
+    parts = energies(x, model.garment, model.material, problem.step, problem.terms, model.surface)
+    return sum(parts.values(), start=jnp.zeros((), x.dtype))
 
 
-def placed(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
-    """x with the exact pins where they are held."""
+def hold_pins(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+    """Return x with the exact pins where they are held."""
     return x if problem.pinned is None else x.at[problem.model.garment.pins].set(problem.pinned)
 
 
-def look(problem: Problem, x: Float[Array, "verts 3"]):
-    """The body near the garment, if its contact is smooth; cloth near cloth, if it touches itself; and from where."""
+def find_neighbours(problem: Problem, x: Float[Array, "verts 3"]) -> Neighbours | None:
+    """Find the body near the garment, if its contact is smooth, and cloth near cloth, if it touches itself; else None."""
     model = problem.model
-    x, near, pairs = lax.stop_gradient(x), None, None
+    x, quadrics, pairs = lax.stop_gradient(x), None, None
     if model.terms.collision == "smooth":
-        near = nearby_quadrics(x, lax.stop_gradient(problem.body), model.surface)
+        quadrics = nearby_quadrics(x, lax.stop_gradient(problem.step.body), model.surface)
     if model.terms.self_contact:
-        pairs = nearby_pairs(x, model.garment.mesh, model.garment.groups, reach(problem))
-    return None if near is None and pairs is None else (near, pairs, x)
+        pairs = nearby_pairs(x, model.garment.mesh, model.garment.groups, search_radius(problem))
+    return None if quadrics is None and pairs is None else Neighbours(quadrics, pairs, x)
 
 
-def reach(problem: Problem):
-    """How far the search for self-contact looks, m."""
+def search_radius(problem: Problem):
+    """Return how far the search for self-contact looks, m."""
     return REACH * problem.model.material.self_thickness
 
 
-def trusted(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
-    """How far a vertex may come from where `look` was, m, until what it left out could matter."""
+def trust_radius(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """Return how far a vertex may come from where neighbours were found, m, until what was left out could matter."""
     far = jnp.asarray(jnp.inf, x.dtype)
     if problem.model.terms.collision == "smooth":
         far = 2 * problem.model.surface.spacing.astype(x.dtype)
     if problem.model.terms.self_contact:
-        far = jnp.minimum(far, (reach(problem) - problem.model.material.self_thickness) / 2)
+        far = jnp.minimum(far, (search_radius(problem) - problem.model.material.self_thickness) / 2)
     return far
 
 
-def come(x: Float[Array, "verts 3"], seen: Float[Array, "verts 3"]) -> Float[Array, ""]:
-    """How far a vertex has come since."""
-    return jnp.sqrt(jnp.max(jnp.sum((x - seen) ** 2, axis=-1)))
+def max_displacement(x: Float[Array, "verts 3"], since: Float[Array, "verts 3"]) -> Float[Array, ""]:
+    """Return how far a vertex has come since, at most, m."""
+    return jnp.sqrt(jnp.max(jnp.sum((x - since) ** 2, axis=-1)))
 
 
-def looked(problem: Problem, x: Float[Array, "verts 3"], seen):
-    """What is near: found anew if a vertex has come farther since it was than can be trusted."""
-    if seen is None:
+def refresh_neighbours(problem: Problem, x: Float[Array, "verts 3"], neighbours: Neighbours | None) -> Neighbours | None:
+    """Return what is near: found anew if a vertex has come farther since it was than can be trusted."""
+    if neighbours is None:
         return None
-    return lax.cond(come(x, seen[-1]) > trusted(problem, x), lambda: look(problem, x), lambda: seen)
+    far = max_displacement(x, neighbours.found_at) > trust_radius(problem, x)
+    return lax.cond(far, lambda: find_neighbours(problem, x), lambda: neighbours)
 
 
-def knowing(problem: Problem, seen) -> Problem:
-    """The problem that knows what `look` found."""
-    return problem if seen is None else replace(problem, near=seen[0], pairs=seen[1], seen=seen[2])
+def with_neighbours(problem: Problem, neighbours: Neighbours | None) -> Problem:
+    """Return the problem that knows what is near."""
+    return problem if neighbours is None else replace(problem, neighbours=neighbours)
 
 
-def touched(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None:
-    """Contact with the body, where the scene has any."""
+def body_contact(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None:
+    """Return contact with the body, where the scene has any."""
     model = problem.model
     if model.terms.collision is None:
         return None
-    return touching(x, problem.body, model.surface, model.material, model.terms, problem.near, problem.only)
+    quadrics = None if problem.neighbours is None else problem.neighbours.quadrics
+    return evaluate_contact(x, problem.step.body, model.surface, model.material, model.terms, quadrics, problem.only)
 
 
-def evaluated(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
-    """Energy, gradient and contact."""
-    value, gradient = jax.value_and_grad(lambda x: energy(problem, x, collision=None, self_contact=False))(x)
-    contact, found = touched(problem, x), None
+def evaluate(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
+    """Return energy, gradient and contact."""
+    model, pairs = problem.model, None if problem.neighbours is None else problem.neighbours.pairs
+    others = replace(problem.terms, collision=None, self_contact=False)
+    parts, gradient, _ = energies_and_gradient(x, model.garment, model.material, problem.step, others)
+    value = sum(parts.values(), start=jnp.zeros((), x.dtype))
+    contact, found = body_contact(problem, x), None
     if contact is not None:
         value, gradient = value + contact.energy, gradient + contact.gradient
-    if problem.pairs is not None:
-        material = problem.model.material
-        found = repulsion(x, problem.pairs, material.self_thickness)
-        value = value + jnp.where(problem.pairs.overflow, jnp.nan, folds.energy(found, material.self_contact))
+    if pairs is not None:
+        material = model.material
+        found = repulsion(x, pairs, material.self_thickness)
+        value = value + jnp.where(pairs.overflow, jnp.nan, folds.energy(found, material.self_contact))
         gradient = gradient + folds.gradient(found, x, material.self_contact)
     if problem.pinned is not None:
         gradient = jnp.where(problem.free[:, None], gradient, 0)
@@ -171,27 +193,25 @@ def evaluated(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
 
 
 def static_step(model: Model) -> Float[Array, ""]:
-    """The time step that damps the way to a static state, s."""
+    """Return the time step that damps the way to a static state, s."""
     size = jnp.max(jnp.ptp(model.garment.mesh.rest, axis=0))
     return STATIC * jnp.sqrt(jnp.maximum(1, size / TALL))
 
 
 def imbalance(problem: Problem, gradient: Float[Array, "verts 3"]) -> Float[Array, "verts"]:
-    """Squared out-of-balance forces over mass; none where there is no mass."""
+    """Return squared out-of-balance forces over mass; none where there is no mass."""
     mass = problem.mass
     return jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / jnp.where(mass > 0, mass, 1), 0)
 
 
-def blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
-    """Blocks of a positive definite approximation of the energy's Hessian; of self-contact those of single vertices."""
-    model, terms = problem.model, problem.model.terms
-    if problem.pinned is not None:
-        terms = replace(terms, pinning=False)
-    touching = None if point.contact is None else point.contact.blocks
-    diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, problem.frame, terms, touching)
+def stiffness_blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
+    """Return blocks of a positive definite approximation of the energy's Hessian; of self-contact those of single vertices."""
+    model, step = problem.model, problem.step
+    contact = None if point.contact is None else point.contact.blocks
+    diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, step, problem.terms, contact)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state, however short a frame.
-    mass, dt = problem.mass, problem.frame.dt
-    dt = jnp.where(problem.moving > 0, dt, jnp.maximum(dt, static_step(model)))
+    mass, dt = problem.mass, step.dt
+    dt = jnp.where(step.moving > 0, dt, jnp.maximum(dt, static_step(model)))
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / dt**2
     if problem.pinned is not None:
         off = jnp.where(jnp.all(problem.free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
@@ -200,17 +220,18 @@ def blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
     return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
 
 
-def factored(problem: Problem, x: Float[Array, "verts 3"], point: Point):
-    """Their Cholesky factor."""
-    return factorise(problem.order, *blocks(problem, x, point))
+def factor_stiffness(problem: Problem, x: Float[Array, "verts 3"], point: Point):
+    """Return the Cholesky factor of `stiffness_blocks`."""
+    return factorise(problem.order, *stiffness_blocks(problem, x, point))
 
 
-def apart(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3"]):
-    """The share of the way p on which no cloth can pass through other cloth, or a patch come near what is not known."""
-    left = reach(problem) - 2 * come(x, problem.seen)  # what was not found is at least so far apart
+def collision_free_step(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3"]):
+    """Return the share of the way p on which no cloth can pass through other cloth, or a patch come near what is not known."""
+    # what was not found is at least so far apart
+    left = search_radius(problem) - 2 * max_displacement(x, problem.neighbours.found_at)
     if problem.only is not None:
         left = left - problem.model.material.self_thickness
-    share = free_share(x, p, problem.pairs, jnp.maximum(left, 0))
+    share = free_share(x, p, problem.neighbours.pairs, jnp.maximum(left, 0))
     if problem.only is not None:
         return share
 
@@ -221,8 +242,8 @@ def apart(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3
     return lax.cond(share < 1, swept, lambda: share)
 
 
-def unhindered(contact: Contact | None, p: Float[Array, "verts 3"]):
-    """The share of a vertex's way p that does not carry it through the body: to the surface, and a little into it."""
+def share_outside_body(contact: Contact | None, p: Float[Array, "verts 3"]):
+    """Return the share of a vertex's way p that does not carry it through the body: to the surface, and a little into it."""
     if contact is None:
         return jnp.ones((), p.dtype)
     reach = jnp.maximum(contact.distance, 0) * 0.9 + CLEARANCE
@@ -230,17 +251,19 @@ def unhindered(contact: Contact | None, p: Float[Array, "verts 3"]):
     return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
 
 
-def descended(problem: Problem, seen, x: Float[Array, "verts 3"], point: Point, p: Float[Array, "verts 3"]):
-    """As far along p as the energy falls: the new positions, what is known of them, what is near, and whether they moved.
+def line_search(
+    problem: Problem, neighbours: Neighbours | None, x: Float[Array, "verts 3"], point: Point, p: Float[Array, "verts 3"]
+):
+    """Go as far along p as the energy falls: return the place, what is known of it, what is near, and whether it is another.
 
-    seen: from `look`, and found anew where a step goes far; None: as the problem knows it.
+    neighbours: found anew where a step goes far; None: as the problem knows them.
     """
     slope = dot(point.gradient, p)
     noise = 16 * jnp.finfo(x.dtype).eps * jnp.abs(point.value)  # of a sum over a garment; with 4 eps float32 stalls
 
-    longest = jnp.min(unhindered(point.contact, p))
-    if problem.pairs is not None:
-        longest = jnp.minimum(longest, apart(knowing(problem, seen), x, p))
+    longest = jnp.min(share_outside_body(point.contact, p))
+    if problem.model.terms.self_contact:
+        longest = jnp.minimum(longest, collision_free_step(with_neighbours(problem, neighbours), x, p))
 
     def too_long(search):
         t, new, _ = search
@@ -252,10 +275,10 @@ def descended(problem: Problem, seen, x: Float[Array, "verts 3"], point: Point, 
     def shorter(search):
         t = search[0] / 2
         there = x + t * p
-        near = looked(problem, there, seen)
-        return t, evaluated(knowing(problem, near), there), near
+        near = refresh_neighbours(problem, there, neighbours)
+        return t, evaluate(with_neighbours(problem, near), there), near
 
-    t, *new = lax.while_loop(too_long, shorter, (2 * longest, point, seen))
+    t, *new = lax.while_loop(too_long, shorter, (2 * longest, point, neighbours))
     moved = t > LEAST_STEP
-    point, seen = jax.tree.map(functools.partial(jnp.where, moved), tuple(new), (point, seen))
-    return jnp.where(moved, x + t * p, x), point, seen, moved
+    point, neighbours = jax.tree.map(functools.partial(jnp.where, moved), tuple(new), (point, neighbours))
+    return jnp.where(moved, x + t * p, x), point, neighbours, moved

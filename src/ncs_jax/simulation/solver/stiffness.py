@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.bending import hinge_weight
 from ncs_jax.energies.contact.friction import SLIP, slipping
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
@@ -42,7 +43,7 @@ class Couplings:
 
 
 def couplings_from(mesh: Mesh) -> Couplings:
-    """All pairs of vertices that a face or a hinge couples."""
+    """Return all pairs of vertices that a face or a hinge couples."""
     faces, hinges = np.asarray(mesh.faces), np.asarray(mesh.hinges)
     of_faces = np.stack([faces[:, p] for p in FACE])
     of_hinges = np.stack([hinges[:, p] for p in HINGE])
@@ -127,18 +128,33 @@ def _bending(x, mesh: Mesh, stiffness):
     areas = jnp.where(mesh.hinge_area > 0, mesh.hinge_area, 1)
     gradient = jax.grad(lambda hinge: jnp.sum(dihedral(hinge, [areas[:, 0], areas[:, 1]])))(corners(x, mesh.hinges))
     gradient = jnp.stack([jnp.stack(corner, axis=-1) for corner in gradient], axis=1)
-    solid = jnp.all(mesh.hinge_area > 0, axis=-1)
-    return gradient, jnp.where(solid, 2 * stiffness * mesh.hinge_length**2 / (8 * jnp.sum(areas, axis=-1)), 0)
+    return gradient, hinge_weight(mesh, 2 * stiffness)
 
 
-def _friction(x, frame: StepInputs, coefficient):
+def _friction(x, step: StepInputs, coefficient):
     """The blocks (verts, 3, 3) of friction, which is convex."""
-    along, normal = slipping(x, frame.carried, frame.pressed)
-    length, slip = norm(along), SLIP * frame.dt
+    along, normal = slipping(x, step.advected, step.lagged_normal_force)
+    length, slip = norm(along), SLIP * step.dt
     within = jnp.eye(3, dtype=x.dtype)[None] - normal[:, :, None] * normal[:, None, :]
     way = jnp.where((length < slip)[:, None], 0, normalize(along))
-    push = coefficient * norm(frame.pressed) / jnp.maximum(length, slip)
+    push = coefficient * norm(step.lagged_normal_force) / jnp.maximum(length, slip)
+    push = push if step.moving is None else step.moving * push
     return push[:, None, None] * (within - way[:, :, None] * way[:, None, :])
+
+
+def _own(x, step: StepInputs, terms: Terms):
+    """Blocks (verts, 3, 3) of own terms, made positive semi-definite: their derivative when the cloth moves as a whole.
+
+    It is exact for a term that looks at vertices one by one, as an attachment spring. A term that couples vertices is known by
+    the line search alone.
+    """
+    gradient = jax.grad(lambda x: sum((term(x, step) for term in terms.own), start=jnp.zeros((), x.dtype)))
+
+    def column(axis):
+        return jax.jvp(gradient, (x,), (jnp.zeros_like(x).at[:, axis].set(1),))[1]
+
+    block = jnp.stack([column(axis) for axis in range(3)])  # (columns, verts, rows)
+    return jnp.transpose(positive_part((block + jnp.swapaxes(block, 0, 2)).transpose(0, 2, 1) / 2), (2, 0, 1))
 
 
 def stiffness(
@@ -146,13 +162,13 @@ def stiffness(
     couplings: Couplings,
     garment: Garment,
     material: Material,
-    frame: StepInputs,
+    step: StepInputs,
     terms: Terms,
     contact: Float[Array, "verts 3 3"] | None = None,
 ) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
-    """Blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
+    """Return blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
 
-    contact: the blocks of collision, where there is any, from `contact.touching`.
+    contact: the blocks of collision, where there is any, from `contact.evaluate_contact`.
 
     The membrane's element Hessians are projected; springs lose their negative part in closed form; bending
     enters by the squares of its first derivatives (Gauss-Newton), exact where the angle is at its rest value.
@@ -182,10 +198,12 @@ def stiffness(
     if contact is not None:
         diagonal = diagonal + contact
     if terms.friction:
-        diagonal = diagonal + _friction(x, frame, material.friction)
+        diagonal = diagonal + _friction(x, step, material.friction)
+    if terms.own:
+        diagonal = diagonal + _own(x, step, terms)
     if terms.pinning:
         pins = garment.pins
-        linear = frame.blended[pins][..., :3]
+        linear = step.vertex_transforms[pins][..., :3]
         inverse = jnp.linalg.inv(linear)
         square = jnp.einsum("pia,pib->pab", inverse, inverse, precision="highest")
         diagonal = diagonal.at[pins].add(2 * material.pinning * square)
@@ -198,7 +216,7 @@ def multiply(
     off: Float[Array, "pairs 3 3"],
     p: Float[Array, "verts 3"],
 ) -> Float[Array, "verts 3"]:
-    """The matrix times a field of vectors."""
+    """Return the matrix times a field of vectors."""
     i, j = couplings.pairs.T
     result = jnp.sum(diagonal * p[:, None, :], axis=-1)
     result = result.at[i].add(jnp.sum(off * p[j][:, None, :], axis=-1))

@@ -1,0 +1,79 @@
+"""What one step needs of a model and a frame, prepared once for training, simulation and evaluation alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.total import contact_force
+from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.scene.model import Model, pose_body
+
+__all__ = ["Past", "step_inputs"]
+
+
+class Past(NamedTuple):
+    """The garment before this step; `None` where no term asks for it."""
+
+    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}, m
+    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}, m
+    unposed: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1} taken back through skinning, m: what friction advects
+    moving: Float[Array, "*poses"] | None = None  # what inertia and friction count: 0 without a past; None: 1
+
+
+def step_inputs(
+    model: Model,
+    matrices: Float[Array, "joints 3 4 *poses"],
+    past: Past | None = None,
+    *,
+    transforms: Float[Array, "verts 3 4 *poses"] | None = None,
+    body: Float[Array, "body 6 *poses"] | None = None,
+    force: Float[Array, "verts 3 *poses"] | None = None,
+) -> StepInputs:
+    """Return what the model's terms read in one frame, or in several poses beside each other, and nothing else.
+
+    Friction reads where the body alone carries the last positions, x_adv = R_t R_{t-1}^-1 x_{t-1}, and the contact force there.
+
+    Args:
+        matrices: joint transforms from rest to pose. past: the garment before; None: it stands still there.
+        transforms: skinning transforms of the garment's vertices, where they are known; else from the model's weights.
+        body: positions (m) and normals of `model.posed_bodies`, where they are known. force: external, N.
+    """
+    terms, past = model.terms, past or Past()
+    posed = normals = None
+    if model.surface is not None and (terms.collision is not None or terms.own):
+        posed, normals = (pose_body(model, matrices), None) if body is None else (body[:, :3], body[:, 3:])
+    if not (terms.pinning or terms.friction or terms.own):
+        transforms = None
+    elif transforms is None:
+        transforms = blend(matrices, model.blend)
+    advected = lagged = None
+    if terms.friction:
+        advected = skin(transforms, past.unposed)
+        lagged = _lagged_normal_force(model, advected, posed)
+    inertia = terms.inertia or bool(terms.own)
+    return StepInputs(
+        1 / model.fps,
+        past.previous if inertia else None,
+        past.before if inertia else None,
+        posed,
+        transforms if terms.pinning or terms.own else None,
+        advected,
+        lagged,
+        normals,
+        force,
+        past.moving if terms.inertia or terms.friction else None,
+    )
+
+
+def _lagged_normal_force(model: Model, advected, body) -> Float[Array, "verts 3 *poses"]:
+    def one(pose):
+        return contact_force(*pose, model.surface, model.terms, model.material)
+
+    if advected.ndim == 2:
+        return one((advected, body))
+    return jnp.moveaxis(lax.map(one, (jnp.moveaxis(advected, -1, 0), jnp.moveaxis(body, -1, 0))), 0, -1)
