@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from ncs_jax.energies.contact.collision import collision
-from ncs_jax.energies.contact.distance import closest_weights, plane_distance, triangle_distance
+from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
 from ncs_jax.energies.contact.smooth import blended_contact, curvatures, nearby_quadrics
 from ncs_jax.energies.contact.surface import rebuild_lists, surface_from, vertex_normals
+from ncs_jax.geometry.closest_point import closest_weights
 
 from .shapes import ball, bracket, rotation, sheet, tube
 

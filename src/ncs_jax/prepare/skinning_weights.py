@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import closest_weights
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.geometry.closest_point import closest_weights
 
 __all__ = ["smooth_weights", "transfer_weights", "used_joints"]
 

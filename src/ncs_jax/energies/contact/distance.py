@@ -7,10 +7,11 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.contact.surface import Surface, face_normals
+from ncs_jax.geometry.closest_point import closest_weights, gap_to
 from ncs_jax.geometry.numerics import angle_between, normalize
 from ncs_jax.geometry.soa_vectors import dot, minus
 
-__all__ = ["closest_weights", "gap_to", "plane_distance", "triangle_distance"]
+__all__ = ["plane_distance", "triangle_distance"]
 
 
 def plane_distance(
@@ -19,7 +20,7 @@ def plane_distance(
     normals: Float[Array, "body 3 *poses"],
     index: Int[Array, "verts *poses"],
 ) -> Float[Array, "verts *poses"]:
-    """Signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
+    """Return the signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
     poses = index[:1].size
     at = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
 
@@ -33,7 +34,7 @@ def plane_distance(
 def triangle_distance(
     x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, index: Int[Array, "verts"]
 ) -> Float[Array, "verts"]:
-    """Exact signed distance in m to the nearest triangle `index`, negative inside.
+    """Return the exact signed distance in m to the nearest triangle `index`, negative inside.
 
         d = n . (x - c),  c the closest point, n = +-(x - c)/|x - c|
 
@@ -56,42 +57,6 @@ def triangle_distance(
     within = jnp.all(weights > 0, axis=-1, keepdims=True) & ~rim
     direction = jnp.where(touching | within | (side == 0), normal, side * away / jnp.where(touching, 1, length))
     return jnp.sum(direction * gap, axis=-1)
-
-
-def gap_to(x, corners, weights):
-    """x - sum_k w_k c_k (..., 3) for weights that add up to 1, as differences from the first corner."""
-    a, b, c = (corners[..., k, :] for k in range(3))
-    return x - a - weights[..., 1:2] * (b - a) - weights[..., 2:] * (c - a)
-
-
-def closest_weights(x, corners):
-    """Barycentric coordinates (verts, 3) of the closest point of each triangle."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, ac, bc = b - a, c - a, c - b
-    normal = jnp.cross(ab, ac)
-    square = jnp.sum(normal * normal, axis=-1)
-
-    def dot(p, q):
-        return jnp.sum(p * q, axis=-1)
-
-    def ratio(p, q):
-        return jnp.clip(p / jnp.where(q > 0, q, 1), 0, 1)
-
-    wa = dot(jnp.cross(bc, x - b), normal)
-    wb = dot(jnp.cross(-ac, x - c), normal)
-    wc = dot(jnp.cross(ab, x - a), normal)
-    face = jnp.stack([wa, wb, wc], axis=-1) / jnp.where(square > 0, square, 1)[:, None]
-    inside = (square > 0) & jnp.all(face > 0, axis=-1)
-    s, t, u = (
-        ratio(dot(x - a, ab), dot(ab, ab)),
-        ratio(dot(x - b, bc), dot(bc, bc)),
-        ratio(dot(x - c, -ac), dot(ac, ac)),
-    )
-    zero = jnp.zeros_like(s)
-    edges = jnp.stack([jnp.stack(w, axis=-1) for w in ([1 - s, s, zero], [zero, 1 - t, t], [u, zero, 1 - u])], axis=1)
-    gap = gap_to(x[:, None], corners[:, None], edges)
-    best = jnp.argmin(jnp.sum(gap * gap, axis=-1), axis=1)
-    return jnp.where(inside[:, None], face, jnp.take_along_axis(edges, best[:, None, None], axis=1)[:, 0])
 
 
 def _pseudo_normal(body, surface, index, weights):

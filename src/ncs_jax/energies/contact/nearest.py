@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact.surface import Surface
-from ncs_jax.geometry.soa_vectors import cross, dot, minus
+from ncs_jax.geometry.closest_point import triangle_square
+from ncs_jax.geometry.soa_vectors import dot
 
 __all__ = ["components", "nearest_groups", "nearest_triangle", "nearest_vertex"]
 
@@ -26,22 +27,7 @@ def _squared_to_points(x, points):
 
 def _squared_to_triangles(x, triangle):
     """Exact squared distance to triangles, corner by corner and component by component."""
-    a, b, c = triangle
-
-    def to_segment(p, edge):
-        length = dot(edge, edge)
-        t = jnp.clip(dot(p, edge) / jnp.where(length > 0, length, 1), 0, 1)
-        rest = [p[i] - t * edge[i] for i in range(3)]
-        return dot(rest, rest)
-
-    ab, bc, ca = minus(b, a), minus(c, b), minus(a, c)
-    normal = cross(ab, minus(c, a))
-    square = dot(normal, normal)
-    pa, pb, pc = minus(x, a), minus(x, b), minus(x, c)
-    inside = (dot(cross(ab, pa), normal) > 0) & (dot(cross(bc, pb), normal) > 0) & (dot(cross(ca, pc), normal) > 0)
-    plane = dot(pa, normal) ** 2 / jnp.where(square > 0, square, 1)
-    border = jnp.minimum(jnp.minimum(to_segment(pa, ab), to_segment(pb, bc)), to_segment(pc, ca))
-    return jnp.where(inside & (square > 0), plane, border)
+    return triangle_square(x, *triangle)
 
 
 def _closer(x, item, name, best, squared):

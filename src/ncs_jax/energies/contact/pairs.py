@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact.surface import compact_groups
+from ncs_jax.geometry.closest_point import ratio, triangle_weights
 from ncs_jax.geometry.mesh import Mesh, topology
 from ncs_jax.geometry.numerics import norm
 from ncs_jax.geometry.soa_vectors import cross, dot, minus
@@ -88,46 +89,18 @@ def groups_from(mesh: Mesh) -> Groups:
 
 
 def corners_of(x: Float[Array, "verts 3"], vertices: Int[Array, "pairs 4"]) -> Float[Array, "4 3 pairs"]:
-    """Positions of the pairs' vertices, the pairs on the last axis, where they fill the vector lanes."""
+    """Return positions of the pairs' vertices, the pairs on the last axis, where they fill the vector lanes."""
     return jnp.transpose(x[vertices], (1, 2, 0))
 
 
-def _ratio(p, q):
-    return jnp.clip(p / jnp.where(q > 0, q, 1), 0, 1)
-
-
 def point_weights(corners: Float[Array, "4 3 pairs"]) -> Float[Array, "4 pairs"]:
-    """(1, -a, -b, -c): of a point and a triangle, whose closest point has the barycentric coordinates (a, b, c).
-
-    The nearest of the three edges, unless the point lies over the inside. Source: Ericson 2005, 5.1.5.
-    """
-    p, a, b, c = corners
-    ab, bc, ca = minus(b, a), minus(c, b), minus(a, c)
-    pa, pb, pc = minus(p, a), minus(p, b), minus(p, c)
-    n = cross(bc, ca)
-    square = dot(n, n)
-    whole = jnp.where(square > 0, square, 1)
-    face = [dot(cross(e, q), n) / whole for e, q in ((bc, pb), (ca, pc), (ab, pa))]
-    inside = (face[0] > 0) & (face[1] > 0) & (face[2] > 0) & (square > 0)
-
-    def edge(q, e):
-        t = _ratio(dot(q, e), dot(e, e))
-        gap = [q[i] - t * e[i] for i in range(3)]
-        return t, dot(gap, gap)
-
-    (s, first), (t, second), (u, third) = edge(pa, ab), edge(pb, bc), edge(pc, ca)
-    on_first, on_second = (first <= second) & (first <= third), second <= third
-    border = [
-        jnp.where(on_first, 1 - s, jnp.where(on_second, 0, u)),
-        jnp.where(on_first, s, jnp.where(on_second, 1 - t, 0)),
-        jnp.where(on_first, 0, jnp.where(on_second, t, 1 - u)),
-    ]
-    closest = [jnp.where(inside, f, e) for f, e in zip(face, border, strict=True)]
-    return jnp.stack([jnp.ones_like(s), *(-w for w in closest)])
+    """Return (1, -a, -b, -c) of a point and a triangle, whose closest point has the barycentric coordinates (a, b, c)."""
+    weights = triangle_weights(*corners)
+    return jnp.stack([jnp.ones_like(weights[0]), *(-w for w in weights)])
 
 
 def edge_weights(corners: Float[Array, "4 3 pairs"]) -> Float[Array, "4 pairs"]:
-    """(1 - s, s, t - 1, -t): of two edges whose closest points are x_0 + s (x_1 - x_0) and x_2 + t (x_3 - x_2).
+    """Return (1 - s, s, t - 1, -t) of two edges with closest points x_0 + s (x_1 - x_0) and x_2 + t (x_3 - x_2).
 
     Where edges are parallel, one of their many closest pairs of points. Source: Ericson 2005, 5.1.9, with s of the two lines
     from cross products, s = (r x v) . (u x v) / |u x v|^2, which do not cancel.
@@ -136,14 +109,14 @@ def edge_weights(corners: Float[Array, "4 3 pairs"]) -> Float[Array, "4 pairs"]:
     u, v, r = minus(b, a), minus(d, c), minus(c, a)
     n = cross(u, v)
     square = dot(n, n)
-    s = jnp.where(square > 0, _ratio(dot(cross(r, v), n), square), 0.5)
-    t = _ratio(s * dot(u, v) - dot(r, v), dot(v, v))
-    s = _ratio(t * dot(u, v) + dot(r, u), dot(u, u))
+    s = jnp.where(square > 0, ratio(dot(cross(r, v), n), square), 0.5)
+    t = ratio(s * dot(u, v) - dot(r, v), dot(v, v))
+    s = ratio(t * dot(u, v) + dot(r, u), dot(u, u))
     return jnp.stack([1 - s, s, t - 1, -t])
 
 
 def separation(corners: Float[Array, "4 3 pairs"], weights: Float[Array, "4 pairs"]) -> Float[Array, "3 pairs"]:
-    """From the closest point of the second primitive to that of the first, sum_i w_i x_i in m; the weights add up to zero."""
+    """Return the way from the second primitive's closest point to the first's, sum_i w_i x_i in m; weights add up to zero."""
     return jnp.sum(weights[1:, None] * (corners[1:] - corners[:1]), axis=0)
 
 
@@ -276,7 +249,7 @@ def candidate_room(count: int) -> int:
 
 
 def nearby_pairs(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups, radius: Float[Array, ""] | float) -> Pairs:
-    """All pairs of point and triangle, and of edge and edge, that are nearer than `radius` and share no vertex.
+    """Find all pairs of point and triangle, and of edge and edge, that are nearer than `radius` and share no vertex.
 
     Args:
         x: (verts, 3) positions in m, a constant to the derivative. mesh, groups: of the garment. radius: in m.
