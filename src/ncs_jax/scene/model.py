@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -12,7 +13,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
-from ncs_jax.energies.terms import Garment, Material, Terms
+from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
+from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
 
@@ -74,6 +76,19 @@ class Model:
     moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
     vibrations: RitzModes | None = None  # where the network swings along them
     under: tuple[Layer, ...] = ()  # garments worn below this one
+
+    def with_terms(self, terms: Sequence[OwnTerm]) -> Model:
+        """Return the model with terms of one's own beside the scene's: see `energies.terms.OwnTerm`.
+
+        Raises:
+            InputError: a term has no name of its own.
+        """
+        try:
+            return replace(self, terms=replace(self.terms, own=tuple(terms)))
+        except ValueError as fault:
+            raise InputError(
+                str(fault), field="terms", mend="define it with `def name(x, step)`, and give it another name"
+            ) from None
 
 
 def pose_garment(
