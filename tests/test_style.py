@@ -43,8 +43,6 @@ LONG_FUNCTIONS: dict[str, str] = {
     "runs.train.train": "to be divided",
     "simulation.solver.cholesky._symbolic": "to be divided",
     "training.loss.gradients": "to be divided",
-    "view.rasteriser._rasterise": "to be divided",
-    "view.rasteriser.render": "to be divided",
 }  # over 60 lines, and why
 MANY_PARAMETERS: dict[str, str] = {
     "energies.contact.nearest._search": "to be divided",
@@ -53,10 +51,6 @@ MANY_PARAMETERS: dict[str, str] = {
     "prepare.build._model": "to be divided",
     "training.loss.gradients": "to be divided",
     "training.step.step": "to be divided",
-    "view.page.write_page": "to be divided",
-    "view.pictures.contact_sheet": "to be divided",
-    "view.pictures.animation_gif": "to be divided",
-    "view.rasteriser._draw_ground": "to be divided",
 }  # over 7, and why
 
 
