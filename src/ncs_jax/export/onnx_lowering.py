@@ -26,7 +26,7 @@ MEND = "export it as stablehlo"
 
 
 class Tensor(NamedTuple):
-    """A value of the graph; an axis may be of length 1 where the trace has it repeated."""
+    """Name a value of the graph; an axis may be of length 1 where the trace has it repeated."""
 
     name: str
     shape: tuple[int, ...]

@@ -34,7 +34,7 @@ INK, FAINT = (46, 42, 40), (142, 135, 128)
 
 @dataclass(frozen=True)
 class _Stage:
-    """An animation with Y up, ready to be drawn: the camera's path (frames, 3), what it must hold (3,), and the floor, m."""
+    """Hold an animation with Y up, the camera's path (frames, 3), half of what it must show (3,), and the floor, m."""
 
     animation: Animation
     path: np.ndarray

@@ -76,7 +76,7 @@ def render(
 
 
 class _Surface(NamedTuple):
-    """All meshes of a picture as one: the colours, as light, outside by vertex and inside by face, NaN where it is the same."""
+    """Hold all meshes of a picture as one; colours as light, outside by vertex, inside by face, NaN where it is the same."""
 
     vertices: np.ndarray
     faces: np.ndarray
