@@ -82,19 +82,19 @@ def draw(path: Path, run: Run, motion: str, animations: dict[str, np.ndarray]) -
     """The contact sheets of all methods below each other, of a motion up to a second after its last stop."""
     from PIL import Image, ImageDraw
 
+    from ncs_jax.view.animation import Animation
+    from ncs_jax.view.character import posed_body
     from ncs_jax.view.pictures import INK, contact_sheet
-    from ncs_jax.view.preview import worn_over
     from ncs_jax.view.rasteriser import PAPER
 
     a = run.assembly
-    body, faces, worn = worn_over(a, run.motion(motion))
+    body = posed_body(a, run.motion(motion))
     end = max((first + round(a.model.fps) for first, _ in stops(run.track(motion), a.model)), default=None)
-    body = None if body is None else body[:end]
     sheets = []
     with tempfile.TemporaryDirectory() as folder:
         for method, vertices in animations.items():
             file = Path(folder) / "sheet.png"
-            contact_sheet(file, vertices[:end], a.garment.faces, body, faces, a.model.fps, tile=260, worn=worn)
+            contact_sheet(file, Animation(vertices, a.garment.faces, a.model.fps, body).until(end), tile=260)
             with Image.open(file) as drawn:
                 sheets.append((method, drawn.convert("RGB")))
     strip = Image.new("RGB", (max(s.width for _, s in sheets), sum(s.height for _, s in sheets)), PAPER)

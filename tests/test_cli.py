@@ -15,7 +15,7 @@ from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
-from ncs_jax.view.preview import posed_body
+from ncs_jax.view.character import body_vertices
 
 from .characters import skinned
 from .scenes import grid, post, swing, write_scene
@@ -305,7 +305,7 @@ def test_animate_with_the_body(run_folder, tmp_path, capsys):
     assert main(["animate", str(folder), "--out", str(tmp_path / "a.glb"), "--body"]) == 0
     run = load_run(folder)
     theirs = skinned(tmp_path / "a.glb", np.arange(24) / run.assembly.model.fps)
-    ours = posed_body(run.assembly.body, run.motion(run.assembly.scene.motion.files[0]))
+    ours = body_vertices(run.assembly.body, run.motion(run.assembly.scene.motion.files[0]))
     assert np.abs(ours - theirs).max() < 1e-5
     assert main(["animate", str(folder), "--out", str(tmp_path / "a.usdc"), "--body"]) == 2
     one_line(capsys, ["a.usdc", ".glb", "body"])

@@ -1,8 +1,10 @@
 """What a host gets: a step with its state in one vector that gives what the stepper gives, in files that need no package."""
 
 import json
+import re
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import jax
@@ -15,7 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.export.step import FORMATS, export, flat_step
+from ncs_jax.export.facts import FORMATS, FileFormat
+from ncs_jax.export.stablehlo import RELEASED, expiry
+from ncs_jax.export.step import flat_step
+from ncs_jax.export.write import export
 from ncs_jax.network.methods.method import for_inference, initial_parameters
 from ncs_jax.network.rollout import stepper
 from ncs_jax.runs.run import Run, assemble
@@ -83,7 +88,7 @@ def test_onnx_gives_what_the_stepper_gives(tmp_path, kind):
     assembly, params, _ = garment(tmp_path, kind)
     motion, file = long(), tmp_path / "out" / "step.onnx"
     made = export(assembly, params, file, motion=motion)
-    assert made.check.apart < 1e-5 and made.check.frames == 240 and made.check.error is None
+    assert made.check.max_difference < 1e-5 and made.check.frames == 240 and made.check.error is None
     for alpha in (1.0, 1.5):
         want = streamed(assembly, assembly.network, params, motion, alpha)
         assert np.ptp(want - want.mean(axis=1, keepdims=True), axis=0).max() > 0.005  # it moves
@@ -168,7 +173,7 @@ def test_other_scenes(tmp_path, change):
     params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))
     motion = long(30)
     made = export(assembly, params, tmp_path / "step.onnx", motion=motion)
-    assert made.check.apart < 1e-5
+    assert made.check.max_difference < 1e-5
     want = streamed(assembly, assembly.network, params, motion)
     np.testing.assert_allclose(played(tmp_path / "step.onnx", motion), want, rtol=0, atol=1e-5)
     assert [joint["name"] for joint in made.facts["joints"]] == (["hips", "chest"] if change is turned_rest else ["0", "1"])
@@ -183,7 +188,7 @@ def test_a_garment_without_a_body(tmp_path):
     motion = long(30)
     alone = io.MotionRecord(motion.poses[:, :1], motion.translation, 30.0, ())
     made = export(assembly, params, tmp_path / "step.onnx", motion=alone)
-    assert made.check.apart < 1e-5 and made.facts["inputs"]["rotations"]["shape"] == [1, 3, 3]
+    assert made.check.max_difference < 1e-5 and made.facts["inputs"]["rotations"]["shape"] == [1, 3, 3]
 
 
 def test_a_descriptor_without_rules_is_refused(tmp_path):
@@ -194,7 +199,7 @@ def test_a_descriptor_without_rules_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"argmax.*network.descriptor = heading_free"):
         export(assembly, params, tmp_path / "step.onnx")
     assert not (tmp_path / "step.onnx").exists()
-    assert export(assembly, params, tmp_path / "step", format="stablehlo", motion=long(9)).check.apart < 1e-5
+    assert export(assembly, params, tmp_path / "step", FileFormat("stablehlo"), motion=long(9)).check.max_difference < 1e-5
 
 
 @pytest.mark.parametrize("options", [{"rank": 3}, {"float16": True}, {"rank": 3, "float16": True}])
@@ -204,7 +209,7 @@ def test_smaller_files_tell_their_error(tmp_path, options):
     whole = run.export(tmp_path / "whole.onnx")
     made = run.export(tmp_path / "smaller.onnx", **options)
     assert made.file.stat().st_size < whole.file.stat().st_size and whole.check.error is None
-    assert made.check.apart < 1e-5 < 1e-3 * made.check.error[1]
+    assert made.check.max_difference < 1e-5 < 1e-3 * made.check.error[1]
     far = 1000 * np.linalg.norm(played(made.file, motion) - run.animate(name), axis=-1)
     np.testing.assert_allclose(made.check.error, (far.mean(), far.max()), rtol=0.02)
     kinds = {x.data_type for x in onnx.load(made.file).graph.initializer if len(x.dims) == 2}
@@ -236,7 +241,7 @@ def test_without_a_runtime_nothing_is_checked(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     made = Run(assembly, params).export(tmp_path / "step.onnx")
     assert made.check is None and "not checked" in str(made) and made.file.exists()
-    monkeypatch.setattr("ncs_jax.export.step.find_spec", lambda name: None)
+    monkeypatch.setattr("ncs_jax.export.stablehlo.find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install flatbuffers"):
         Run(assembly, params).export(tmp_path / "step", format="stablehlo")
 
@@ -261,7 +266,7 @@ def test_stablehlo_runs_with_jax_alone(tmp_path, float16):
     assembly, params, _ = garment(tmp_path, "gated")
     motion, run = long(40), Run(assembly, params)
     made = run.export(tmp_path / "step", format="stablehlo", float16=float16)
-    assert made.check.apart < 1e-5 and (made.check.error is not None) == float16
+    assert made.check.max_difference < 1e-5 and (made.check.error is not None) == float16
     rotations = np.asarray(local_rotations(assembly.model, jnp.asarray(motion.poses)))
     np.savez(tmp_path / "given.npz", rotations=rotations, places=motion.translation)
     command = [sys.executable, "-c", ALONE, *(str(tmp_path / name) for name in ("step", "given.npz", "out.npy"))]
@@ -274,15 +279,39 @@ def test_stablehlo_runs_with_jax_alone(tmp_path, float16):
 def test_the_facts_say_what_a_host_has_to_know(tmp_path):
     assembly, params, _ = garment(tmp_path, "gated")
     for format in FORMATS:
-        made = export(assembly, params, tmp_path / f"step.{format}", format=format)
+        made = export(assembly, params, tmp_path / f"step.{format}", FileFormat(format))
         facts = json.loads((tmp_path / f"step.{format}.json").read_text())
         assert facts == made.facts and facts["format"].startswith(format) and facts["file"] == f"step.{format}"
+        assert ("usable_until" in facts) == (format == "stablehlo") == ("usable until" in str(made))
     assert (facts["fps"], facts["vertices"], facts["interface"], facts["gravity"]) == (30.0, 30, 1, [0, -9.81, 0])
     assert facts["alpha"] == {"from": 0.0, "trained": 1.0} and facts["outputs"]["vertices"]["shape"] == [30, 3]
     assert [(joint["number"], joint["parent"]) for joint in facts["joints"]] == [(0, -1), (1, 0)]
     np.testing.assert_allclose([joint["rest"] for joint in facts["joints"]], post()["joints"], atol=1e-6)
     pose = garment(tmp_path, "pbns")
     assert export(pose[0], pose[1], tmp_path / "step.onnx").facts["alpha"] is None
+
+
+@pytest.mark.parametrize(
+    ("version", "until", "counted"),
+    [
+        ("0.10.2", "2026-12-17", "six months, counted from the release of jax 0.10.2 on 2026-06-17"),
+        ("0.13.0.dev20260831+ab1f", "2027-02-28", "the release of jax 0.13.0.dev20260831+ab1f on 2026-08-31"),
+        ("0.99.0", "2028-02-29", "counted from today, 2027-08-31, as the release date of jax 0.99.0 is not known here"),
+    ],
+)
+def test_an_artifact_says_until_when_it_loads(version, until, counted):
+    facts = expiry(version, date(2027, 8, 31))
+    assert facts["usable_until"] == until and counted in facts["usable_until_means"]
+
+
+def test_an_artifact_counts_from_the_jax_that_writes_it(tmp_path):
+    """Every JAX that `constraints/` pins has its release date, so that this never depends on the day."""
+    pins = [re.findall(r"^jax==(.+)$", file.read_text(), re.M) for file in (ROOT / "constraints").glob("*.txt")]
+    assert pins and {version for found in pins for version in found} <= set(RELEASED)
+    assembly, params, _ = garment(tmp_path, "pbns")
+    made = export(assembly, params, tmp_path / "step", FileFormat("stablehlo"))
+    assert made.facts | expiry(jax.__version__, date.today()) == made.facts
+    assert f"usable until {made.facts['usable_until']}: a JAX released later may refuse the file" in str(made)
 
 
 HOST = """

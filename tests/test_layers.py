@@ -13,7 +13,7 @@ from ncs_jax.energies.contact.distance import plane_distance
 from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.scene.model import pose_body
-from ncs_jax.view.preview import worn_over
+from ncs_jax.view.character import posed_body
 
 from .scenes import SCENE, write_scene
 from .shapes import tube
@@ -61,7 +61,8 @@ def test_what_collides_is_the_body_and_the_garment_below_where_it_is(folder, wor
 def test_what_is_drawn_below_is_the_body_and_then_the_garments(folder, worn):
     (motion,) = worn.motions.values()
     x, below = load_run(folder / "run").animate(str(folder / "swing.npz")), worn.model.under[0].model.garment.mesh
-    vertices, faces, count = worn_over(worn, motion)
+    posed = posed_body(worn, motion)
+    vertices, faces, count = posed.vertices, posed.faces, posed.worn
     assert count == x.shape[1] and vertices.shape[1] == len(worn.body.vertices) + count
     np.testing.assert_allclose(vertices[:, -count:], x, atol=1e-6)
     np.testing.assert_array_equal(faces[: len(worn.body.faces)], worn.body.faces)

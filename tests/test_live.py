@@ -8,7 +8,8 @@ from PIL import Image
 
 from ncs_jax import InputError, io, train
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.view.live import BINS, COLOURS, View, colour_bins, measured, shown, view
+from ncs_jax.view.character import animation_of, body_vertices
+from ncs_jax.view.live import BINS, COLOURS, View, animated_garment, colour_bins, vertex_values, view
 
 from .scenes import write_scene
 from .test_viewer import BROWSER
@@ -28,7 +29,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def carried(scene):
-    return shown(str(scene))
+    return animated_garment(str(scene))
 
 
 def test_a_scene_is_shown_as_the_body_carries_it(carried):
@@ -36,8 +37,20 @@ def test_a_scene_is_shown_as_the_body_carries_it(carried):
     model, track = carried.run.assembly.model, carried.run.track(carried.motions[0])
     assert x.shape == (24, 30, 3) and not carried.controlled
     assert np.abs(x[0] - np.asarray(model.garment.mesh.rest)).max() < 1e-5  # the motion begins at rest
-    speed = measured("speed as seen from the body", carried.run, x, track, 5, None)
+    speed = vertex_values("speed as seen from the body", carried.run, x, track, 5, None)
     assert np.abs(speed).max() < 1e-2  # and the garment does not move of itself
+
+
+def test_an_animation_of_a_run_is_on_its_body(carried):
+    run, name = carried.run, carried.motions[0]
+    x, assembly = carried.animate(name, 1.0), run.assembly
+    made = animation_of(assembly, run.motion(name), x)
+    assert made.garment is x and made.fps == assembly.model.fps and made.body.worn == 0
+    np.testing.assert_array_equal(made.garment_faces, assembly.garment.faces)
+    np.testing.assert_array_equal(made.body.vertices, body_vertices(assembly.body, run.motion(name)))
+    np.testing.assert_allclose(made.body.vertices[0], assembly.body.vertices, atol=1e-6)  # the motion begins at rest
+    with pytest.raises(InputError, match="23 frames"):
+        animation_of(assembly, run.motion(name), x[:-1])
 
 
 def test_colours_are_of_what_they_say(carried):
@@ -46,17 +59,20 @@ def test_colours_are_of_what_they_say(carried):
     assert isinstance(track, MotionFeatures)
     stretched = x.copy()
     stretched[0] = x[0].mean(axis=0) + 1.2 * (x[0] - x[0].mean(axis=0))
-    np.testing.assert_allclose(measured("strain", run, stretched, track, 0, None), 20, rtol=1e-3)
+    np.testing.assert_allclose(vertex_values("strain", run, stretched, track, 0, None), 20, rtol=1e-3)
     aside = x + np.array([0, 0, 0.02], np.float32)
-    np.testing.assert_allclose(measured("distance to the overlay", run, x, track, 3, aside), 20, rtol=1e-3)
-    assert not measured("distance to the overlay", run, x, track, 3, None).any()
+    np.testing.assert_allclose(vertex_values("distance to the overlay", run, x, track, 3, aside), 20, rtol=1e-3)
+    assert not vertex_values("distance to the overlay", run, x, track, 3, None).any()
     inside = x.copy()
     inside[0, :, 2] -= 0.03  # the cloth hangs 1 cm before a post of 8 cm
-    depth = measured("distance inside the body", run, inside, track, 0, None)
-    assert depth.max() == pytest.approx(20, abs=1.5) and not measured("distance inside the body", run, x, track, 0, None).any()
+    depth = vertex_values("distance inside the body", run, inside, track, 0, None)
+    assert (
+        depth.max() == pytest.approx(20, abs=1.5)
+        and not vertex_values("distance inside the body", run, x, track, 0, None).any()
+    )
     u = x.copy()
     u[4] += np.array([0, 0.01, 0], np.float32)
-    np.testing.assert_allclose(measured("speed as seen from the body", run, u, track, 4, None), 300, rtol=2e-2)
+    np.testing.assert_allclose(vertex_values("speed as seen from the body", run, u, track, 4, None), 300, rtol=2e-2)
 
 
 def test_faces_have_the_colour_of_their_corners():
@@ -70,7 +86,7 @@ def test_what_cannot_be_shown_is_named(scene, tmp_path):
     io.write_animation(file, np.zeros((3, 30, 3), np.float32), np.array([[0, 1, 2]], np.int32), 30.0)
     for given, told in (((str(file),), "--scene"), ((str(file), str(scene)), "24, 30, 3"), (("nowhere.toml",), "nowhere")):
         with pytest.raises(InputError, match=told):
-            shown(*given)
+            animated_garment(*given)
 
 
 def test_the_page_plays_scrubs_and_colours(carried):
@@ -85,9 +101,9 @@ def test_the_page_plays_scrubs_and_colours(carried):
         for name in COLOURS:
             window.colour.value = name
             window.wait(0.1)
-            assert name in window.told.content and not window.cloth.visible
+            assert name in window.caption.content and not window.cloth.visible
             assert sum(len(part.faces) for part in window.bins if part.visible) == len(window.faces)
-        assert "mean 34.6" in window.told.content  # mm: 20 along each axis
+        assert "mean 34.6" in window.caption.content  # mm: 20 along each axis
     finally:
         window.close()
 
@@ -110,7 +126,7 @@ def test_a_browser_shows_a_run(scene, tmp_path):
     window = view(str(tmp_path / "run"), port=0)
     picture = tmp_path / "page.png"
     try:
-        assert window.what.controlled
+        assert window.subject.controlled
         window.playing.value = False
         command = [str(BROWSER), "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=900,700", "--virtual-time-budget=15000"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from PIL import Image
 
 from ncs_jax.errors import InputError
 from ncs_jax.view import curves, pictures
-from ncs_jax.view.rasteriser import PAPER, Camera, DrawnMesh, Ground, render
+from ncs_jax.view.animation import Animation, PosedBody, upright
+from ncs_jax.view.camera import Camera
+from ncs_jax.view.ground import Ground
+from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
 
@@ -29,7 +33,7 @@ def tube(rings: int, around: int, radius: float, low: float, high: float) -> tup
 
 
 @pytest.fixture(scope="module")
-def swing() -> dict:
+def swing() -> Animation:
     """A ring of cloth about a leaning cylinder that walks 1 m along X in 2 s."""
     fps, frames = 15.0, 30
     body, body_faces = tube(12, 20, 0.15, 0.0, 1.6)
@@ -41,13 +45,8 @@ def swing() -> dict:
     def move(v, lag):
         return np.stack([v[:, 0] + lag * v[:, 1], v[:, 1] + 0 * lag, v[:, 2] + 0 * lag], -1)
 
-    return {
-        "garment": (move(cloth, lean) + shift).astype(np.float32),
-        "garment_faces": faces,
-        "body": (move(body, 0.5 * lean) + shift).astype(np.float32),
-        "body_faces": body_faces,
-        "fps": fps,
-    }
+    post = PosedBody((move(body, 0.5 * lean) + shift).astype(np.float32), body_faces)
+    return Animation((move(cloth, lean) + shift).astype(np.float32), faces, fps, post)
 
 
 def square(z: float, half: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
@@ -171,17 +170,17 @@ def test_the_grid_stands_still_under_a_moving_camera():
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, -1, 0), (0, 0, -2.0), (1, 2, 3)])
 def test_upright_is_a_rotation_that_brings_up_to_y(up: tuple, rng: np.random.Generator):
-    turned = pictures.upright(np.concatenate([np.eye(3), [np.array(up) / np.linalg.norm(up)]]), up)
+    turned = upright(np.concatenate([np.eye(3), [np.array(up) / np.linalg.norm(up)]]), up)
     assert np.allclose(turned[3], [0, 1, 0], atol=1e-12)
     assert np.allclose(turned[:3] @ turned[:3].T, np.eye(3), atol=1e-12) and np.linalg.det(turned[:3]) > 0
 
 
 def test_a_z_up_character_that_faces_minus_y_comes_to_face_the_front():
-    assert np.allclose(pictures.upright(np.array([[0.0, -1.0, 0.0]]), (0, 0, 1)), [[0, 0, 1]])
+    assert np.allclose(upright(np.array([[0.0, -1.0, 0.0]]), (0, 0, 1)), [[0, 0, 1]])
 
 
 def test_contact_sheet(tmp_path, swing):
-    pictures.contact_sheet(tmp_path / "a.png", **swing, frames=3, tile=120)
+    pictures.contact_sheet(tmp_path / "a.png", swing, frames=3, tile=120)
     picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     cloth = picture[..., 0] - picture[..., 2] > 60
     # Two rows of three, each with its garment in the middle.
@@ -192,26 +191,26 @@ def test_contact_sheet(tmp_path, swing):
 
 def test_a_garment_worn_below_is_blue(tmp_path, swing):
     def blue(worn):
-        pictures.contact_sheet(tmp_path / "a.png", **swing, frames=2, tile=120, worn=worn)
+        dressed = replace(swing, body=replace(swing.body, worn=worn))
+        pictures.contact_sheet(tmp_path / "a.png", dressed, frames=2, tile=120)
         r, _, b = np.moveaxis(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int), 2, 0)
         return (b > r + 10).sum()
 
-    verts = swing["body"].shape[1]
+    verts = swing.body.vertices.shape[1]
     assert blue(0) == 0 and 0 < blue(verts // 2) < blue(verts)
 
 
 def test_contact_sheet_turns_with_the_character(tmp_path, swing):
     """A character that has turned by 90 degrees is seen from its front all the same."""
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
-    vertices, faces = swing["garment"][0] * np.float32([1, 1, 0.4]), swing["garment_faces"]
-    garment = np.stack([vertices, vertices @ turn.T])
-    stage = pictures._stage(garment, faces, None, None, 30.0, (0, 1, 0))
+    vertices = swing.garment[0] * np.float32([1, 1, 0.4])
+    stage = pictures._stage(Animation(np.stack([vertices, vertices @ turn.T]), swing.garment_faces, 30.0))
     assert stage.heading(1) == pytest.approx(90, abs=1e-3)
-    assert stage.frame_up(1, 90.0)[3] == pytest.approx(stage.frame_up(0, 0.0)[3], rel=1e-5)
+    assert stage.bounds(1, 90.0)[3] == pytest.approx(stage.bounds(0, 0.0)[3], rel=1e-5)
 
 
 def test_animation_gif(tmp_path, swing):
-    pictures.animation_gif(tmp_path / "a.gif", **swing, max_frames=10, size=(90, 120))
+    pictures.animation_gif(tmp_path / "a.gif", swing, max_frames=10, size=(90, 120))
     with Image.open(tmp_path / "a.gif") as gif:
         assert gif.size == (90, 120) and gif.n_frames == 10 and gif.info["loop"] == 0
         seconds = []
@@ -224,30 +223,60 @@ def test_animation_gif(tmp_path, swing):
 
 
 def test_animation_gif_keeps_to_its_size(tmp_path, swing):
-    pictures.animation_gif(tmp_path / "a.gif", **swing, size=(90, 120), max_frames=12)
+    pictures.animation_gif(tmp_path / "a.gif", swing, size=(90, 120), max_frames=12)
     whole = (tmp_path / "a.gif").stat().st_size
-    pictures.animation_gif(tmp_path / "a.gif", **swing, size=(90, 120), max_frames=12, max_bytes=whole // 2)
+    pictures.animation_gif(tmp_path / "a.gif", swing, size=(90, 120), max_frames=12, max_bytes=whole // 2)
     assert (tmp_path / "a.gif").stat().st_size <= whole // 2
 
 
 def test_half_a_garment_that_is_nan_and_no_body(tmp_path, swing):
-    garment = swing["garment"].copy()
+    garment = swing.garment.copy()
     garment[5:] = np.nan
     garment[2, 3] = 1e20
-    pictures.contact_sheet(tmp_path / "a.png", garment, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
-    pictures.animation_gif(tmp_path / "a.gif", garment, swing["garment_faces"], None, None, 15.0, max_frames=3, size=(40, 50))
-    pictures.contact_sheet(tmp_path / "b.png", garment * np.nan, swing["garment_faces"], None, None, 15.0, frames=2, tile=60)
+    broken = replace(swing, garment=garment, body=None)
+    pictures.contact_sheet(tmp_path / "a.png", broken, frames=2, tile=60)
+    pictures.animation_gif(tmp_path / "a.gif", broken, max_frames=3, size=(40, 50))
+    pictures.contact_sheet(tmp_path / "b.png", replace(broken, garment=garment * np.nan), frames=2, tile=60)
     assert all((tmp_path / name).stat().st_size > 100 for name in ("a.png", "a.gif", "b.png"))
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [({"garment": np.zeros((4, 3))}, "garment"), ({"body": np.zeros((2, 5, 3))}, "body"), ({"fps": 0.0}, "fps"),
-     ({"up": (0.0, 0.0, 0.0)}, "up"), ({"body_faces": None}, "body_faces")],
-)  # fmt: skip
-def test_arguments_that_do_not_fit_are_named(tmp_path, swing, change: dict, field: str):
-    with pytest.raises(InputError, match=field):
-        pictures.contact_sheet(tmp_path / "a.png", **{**swing, **change})
+    [
+        (lambda a: replace(a, garment=np.zeros((4, 3))), "garment"),
+        (lambda a: replace(a, garment=a.garment[:0]), "garment"),
+        (lambda a: replace(a, garment=a.garment[:, :-1]), "garment_faces"),
+        (lambda a: replace(a, garment_faces=np.zeros((3, 4), int)), "garment_faces"),
+        (lambda a: replace(a, garment_faces=a.garment_faces.astype(float)), "garment_faces"),
+        (lambda a: replace(a, fps=0.0), "fps"),
+        (lambda a: replace(a, fps=np.nan), "fps"),
+        (lambda a: replace(a, up=(0.0, 0.0, 0.0)), "up"),
+        (lambda a: replace(a, body=PosedBody(a.body.vertices[:2], a.body.faces)), "body"),
+        (lambda a: PosedBody(a.body.vertices[0], a.body.faces), "body"),
+        (lambda a: PosedBody(a.body.vertices, None), "body_faces"),
+        (lambda a: PosedBody(a.body.vertices, a.body.faces - 1), "body_faces"),
+        (lambda a: PosedBody(a.body.vertices, a.body.faces, worn=-1), "worn"),
+        (lambda a: PosedBody(a.body.vertices, a.body.faces, worn=10_000), "worn"),
+    ],
+)
+def test_an_animation_that_does_not_fit_together_is_refused(swing, change, field: str):
+    with pytest.raises(InputError) as caught:
+        change(swing)
+    assert caught.value.field == field
+
+
+def test_an_animation_turns_upright_and_ends_early(swing):
+    def lying(x):  # Z up, facing -Y
+        return np.stack([x[..., 0], -x[..., 2], x[..., 1]], -1)
+
+    body = replace(swing.body, vertices=lying(swing.body.vertices), worn=7)
+    turned = replace(swing, garment=lying(swing.garment), body=body, up=(0.0, 0.0, 2.0)).y_up()
+    np.testing.assert_allclose(turned.garment, swing.garment, atol=1e-6)
+    np.testing.assert_allclose(turned.body.vertices, swing.body.vertices, atol=1e-6)
+    assert turned.up == (0.0, 1.0, 0.0) and turned.body.worn == 7
+    early = swing.until(5)
+    assert len(early.garment) == len(early.body.vertices) == 5
+    assert np.array_equal(replace(swing, body=None).until(None).garment, swing.garment)
 
 
 def test_energy_curves(tmp_path):

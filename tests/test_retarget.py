@@ -19,7 +19,7 @@ from ncs_jax.prepare.joint_names import anatomy, pair
 from ncs_jax.prepare.motion_import import lead, load_motion, retarget_to_body
 from ncs_jax.prepare.retarget import body_names, retarget, with_skeleton
 from ncs_jax.scene.spec import MotionSpec, load_scene, packaged, scene_from
-from ncs_jax.view.preview import posed_body
+from ncs_jax.view.character import body_vertices
 
 CLIPS = ("10_01", "02_02", "03_03")
 
@@ -448,7 +448,7 @@ def check_upright(body: BodyRecord, moved: MotionRecord, names) -> None:
     ground = body.vertices[:, 1].min()
     trunk = at["head"] - at["hips"]
     assert np.all(trunk[:, 1] > 0.8 * np.linalg.norm(trunk, axis=1)) and np.all(at["hips"][:, 1] - ground > 0.4 * tall)
-    low = posed_body(body, moved)[..., 1].min(axis=1) - ground
+    low = body_vertices(body, moved)[..., 1].min(axis=1) - ground
     assert np.percentile(low, 5) == pytest.approx(0, abs=0.01) and low.min() > -0.03 and np.percentile(low, 95) < 0.1
     left = at["left thigh"] - at["right thigh"]
     forward_ = np.cross(left, [0, 1, 0])

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import zlib
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from PIL import Image
 
 from ncs_jax.errors import InputError
+from ncs_jax.view.animation import Animation, PosedBody
 from ncs_jax.view.page import write_page
 
 FRAMES = 24
@@ -95,8 +97,11 @@ class Page(HTMLParser):
 
 
 def written(tmp_path: Path, scene: dict, **changes) -> Page:
-    path = tmp_path / "preview.html"
-    write_page(path, **{**scene, **changes})
+    """Write a page of the fixture's arrays, some of them changed."""
+    path, given = tmp_path / "preview.html", {"worn": 0, "title": "", "facts": {}, **scene, **changes}
+    body = None if given["body"] is None else PosedBody(given["body"], given["body_faces"], given["worn"])
+    animations = {label: Animation(x, given["garment_faces"], given["fps"], body) for label, x in given["animations"].items()}
+    write_page(path, animations, title=given["title"], facts=given["facts"])
     return Page(path)
 
 
@@ -126,7 +131,7 @@ def test_a_smooth_motion_is_small(tmp_path):
     cloth, faces = tube(32, 32, 0.3, 0.6, 1.2)
     t = np.arange(240)[:, None, None] / 30
     moving = (cloth + 0.2 * np.sin(t + cloth[:, 1:2]) * [1.0, 0.2, 0.5]).astype(np.float32)
-    written(tmp_path, {}, animations={"0": moving}, garment_faces=faces, body=None, body_faces=None, fps=30, title="", facts={})
+    written(tmp_path, {}, animations={"0": moving}, garment_faces=faces, body=None, body_faces=None, fps=30)
     assert (tmp_path / "preview.html").stat().st_size < 0.5 * moving.nbytes
 
 
@@ -179,11 +184,14 @@ BAD = {
     "infinite": (lambda s: {"animations": {**s["animations"], "1": _with(s["animations"]["1"], np.inf)}}, "animations['1']"),
     "huge": (lambda s: {"animations": {**s["animations"], "1": _with(s["animations"]["1"], 1e9)}}, "animations['1']"),
     "body nan": (lambda s: {"body": _with(s["body"], np.nan)}, "body"),
-    "frames": (lambda s: {"animations": {**s["animations"], "1": s["animations"]["1"][:-1]}}, "animations['1']"),
-    "verts": (lambda s: {"animations": {**s["animations"], "1": s["animations"]["1"][:, :-1]}}, "animations['1']"),
+    "frames": (lambda s: {"body": None, "animations": {**s["animations"], "1": s["animations"]["1"][:-1]}}, "animations['1']"),
+    "verts": (
+        lambda s: {"animations": {**s["animations"], "1": np.repeat(s["animations"]["1"], 2, axis=1)}},
+        "animations['1']",
+    ),
     "body frames": (lambda s: {"body": s["body"][:-1]}, "body"),
-    "flat": (lambda s: {"animations": {"0": s["animations"]["0"][0]}}, "animations['0']"),
-    "empty": (lambda s: {"animations": {"0": s["animations"]["0"][:0]}}, "animations['0']"),
+    "flat": (lambda s: {"animations": {"0": s["animations"]["0"][0]}}, "garment"),
+    "empty": (lambda s: {"animations": {"0": s["animations"]["0"][:0]}}, "garment"),
     "none": (lambda s: {"animations": {}}, "animations"),
     "faces": (lambda s: {"garment_faces": s["garment_faces"] + 1}, "garment_faces"),
     "quads": (lambda s: {"garment_faces": np.zeros((3, 4), int)}, "garment_faces"),
@@ -199,6 +207,36 @@ def test_what_cannot_be_shown_is_named(tmp_path, scene, name):
         written(tmp_path, scene, **change(scene))
     assert caught.value.field == field
     assert not (tmp_path / "preview.html").exists()
+
+
+DIFFERENT = {
+    "faces": lambda a: replace(a, garment_faces=a.garment_faces[::-1]),
+    "fps": lambda a: replace(a, fps=24.0),
+    "up": lambda a: replace(a, up=(0.0, 0.0, 1.0)),
+    "no body": lambda a: replace(a, body=None),
+    "body": lambda a: replace(a, body=replace(a.body, vertices=a.body.vertices + 1)),
+    "body faces": lambda a: replace(a, body=replace(a.body, faces=a.body.faces[::-1])),
+    "worn": lambda a: replace(a, body=replace(a.body, worn=1)),
+}
+
+
+@pytest.mark.parametrize("name", DIFFERENT)
+def test_one_page_has_one_body_and_one_garment(tmp_path, scene, name):
+    body = PosedBody(scene["body"], scene["body_faces"])
+    one = Animation(scene["animations"]["0"], scene["garment_faces"], 30.0, body)
+    write_page(tmp_path / "a.html", {"0": one, "1": replace(one, body=PosedBody(body.vertices.copy(), body.faces))})
+    with pytest.raises(InputError, match="as animations") as caught:
+        write_page(tmp_path / "b.html", {"0": one, "1": DIFFERENT[name](one)})
+    assert caught.value.field == "animations['1']" and not (tmp_path / "b.html").exists()
+
+
+def test_a_page_turns_what_has_another_up(tmp_path, scene):
+    garment = np.stack([scene["animations"]["0"][..., i] for i in (0, 2, 1)], -1) * np.float32([1, -1, 1])
+    lying = Animation(garment, scene["garment_faces"], 30.0, up=(0.0, 0.0, 1.0))
+    write_page(tmp_path / "a.html", {"0": lying})
+    page = Page(tmp_path / "a.html")
+    stored = page.vertices("track-0", page.scene["garment"], page.scene["garment"]["tracks"][0])
+    np.testing.assert_allclose(stored, scene["animations"]["0"], rtol=0, atol=3e-5)
 
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)

@@ -42,6 +42,7 @@ def fit(options) -> int:
     from ncs_jax.io.mesh.surface import boundary_loops, summarise_surface
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.fit import fit as fitted
+    from ncs_jax.view.animation import Animation, PosedBody
     from ncs_jax.view.pictures import contact_sheet
 
     out, scene = Path(options.out), Scene()
@@ -78,7 +79,8 @@ def fit(options) -> int:
     io.write_garment(out, g)
     picture, sides = out.with_suffix(".png"), np.repeat(body.vertices[None], 2, axis=0)
     labels = ("placed", "out of the body")
-    contact_sheet(picture, np.stack([found.before, x]), g.faces, sides, body.faces, 1.0, frames=2, labels=labels)
+    animation = Animation(np.stack([found.before, x]), g.faces, 1.0, PosedBody(sides, body.faces))
+    contact_sheet(picture, animation, frames=2, labels=labels)
     print(f"wrote {out} and {picture}. In the scene file:\n\n[body]\nfile = {json.dumps(options.body)}\n")
     print(f"[garment]\nfile = {json.dumps(out.name)}" + (f'\npins = "{PINS}"' if PINS in g.groups else ""))
     return 0

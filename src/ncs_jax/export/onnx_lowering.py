@@ -1,8 +1,8 @@
 """A traced function as an ONNX graph: one rule a primitive, in operators that game engines run.
 
-Everything that depends on no input is worked out here: sines of constants, indices, whole branches. What is left has static
-shapes, no control flow and no integers but shapes, axes and constant indices. An axis that a value is only repeated along
-stays of length 1 for as long as the operators read it so: most of what a trace broadcasts is never made.
+What depends on no input is computed here: sines of constants, indices, whole branches. What is left has static shapes, no
+control flow, and no integers but shapes, axes and constant indices. An axis along which a value only repeats stays of length 1
+as long as the operators accept that: most of what a trace broadcasts is never made.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MEND = "export it as stablehlo"
 
 
 class Tensor(NamedTuple):
-    """A value of the graph; an axis may be of length 1 where the trace has it repeated."""
+    """Name a value of the graph; an axis may be of length 1 where the trace has it repeated."""
 
     name: str
     shape: tuple[int, ...]
@@ -38,16 +38,16 @@ Value = Tensor | np.ndarray  # an array does not depend on the inputs
 def onnx_model(
     function: Callable, arguments: dict[str, tuple[int, ...]], results: Sequence[str], *, opset: int = 15, facts: str = ""
 ) -> Any:
-    """The `onnx.ModelProto` of a function of float32 arrays.
+    """Return the `onnx.ModelProto` of a function of float32 arrays.
 
     Args:
-        function: of as many arrays as there are arguments, gives as many as there are results. arguments: names and shapes.
-        opset: in `OPSETS`. facts: a text kept in the model's metadata, under `ncs_jax`.
+        function: of as many arrays as there are arguments; it returns as many as there are results.
+        arguments: their names and shapes. opset: in `OPSETS`. facts: a text kept in the model's metadata, under `ncs_jax`.
 
     float16 constants are stored so, and widened by a Cast before they are used.
 
     Raises:
-        InputError: onnx is not installed, the opset is another, or the function does what no rule is for.
+        InputError: onnx is not installed, the opset is another, or the function does what no rule covers.
     """
     onnx = _onnx()
     if not OPSETS[0] <= opset <= OPSETS[1]:
@@ -60,12 +60,12 @@ def onnx_model(
         [graph.whole(x, v.aval.shape) for x, v in zip(outputs, closed.jaxpr.outvars, strict=True)], results
     )
 
-    def told(name, shape):
+    def described(name, shape):
         return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
 
     shapes = [v.aval.shape for v in closed.jaxpr.outvars]
     made = onnx.helper.make_graph(
-        nodes, "step", [told(*x) for x in inputs], [told(*x) for x in zip(results, shapes, strict=True)], weights
+        nodes, "step", [described(*x) for x in inputs], [described(*x) for x in zip(results, shapes, strict=True)], weights
     )
     sets = [onnx.helper.make_opsetid("", opset)]
     least = onnx.helper.find_min_ir_version_for(sets)
@@ -85,7 +85,7 @@ def _onnx():
 
 
 class _Graph:
-    """Nodes in order, each only once; reshapes of reshapes are one; what nothing reads is left out at the end."""
+    """Collect nodes in order, each only once; reshapes of reshapes are one; what nothing reads is left out at the end."""
 
     def __init__(self, onnx):
         self._onnx = onnx
@@ -97,7 +97,7 @@ class _Graph:
         self._narrow: dict[str, np.ndarray] = {}  # constants of which half the bits are stored
 
     def add(self, operator: str, *inputs: Value, shape: Sequence[int], **attributes) -> Tensor:
-        """One node, and what it gives."""
+        """Add one node, and return its result."""
         names = tuple(self._name(x) for x in inputs)
         key = (operator, names, tuple(sorted((k, str(v)) for k, v in attributes.items())))
         if key not in self._known:
@@ -115,21 +115,21 @@ class _Graph:
         return self._weights.setdefault(key, (f"constant_{len(self._weights)}", x))[0]
 
     def widened(self, x: np.ndarray) -> Tensor:
-        """A float16 constant, stored so, in float32."""
+        """Store a float16 constant as it is, and return it cast to float32."""
         out = self.add("Cast", x, shape=x.shape, to=self._onnx.TensorProto.FLOAT)
         self._narrow[out.name] = x
         return out
 
     def fixed(self, x: Value) -> bool:
-        """Whether nothing that comes in changes it."""
+        """Tell whether a value is the same whatever the inputs are."""
         return not isinstance(x, Tensor) or x.name in self._narrow
 
     def factors(self, x: Tensor) -> tuple[Value, Value] | None:
-        """What a product is of."""
+        """Return the two factors of a product; None for another value."""
         return self._products.get(x.name)
 
     def reshape(self, x: Value, shape: Sequence[int]) -> Value:
-        """The same numbers in another shape."""
+        """Return the same numbers in another shape."""
         shape = tuple(int(n) for n in shape)
         if isinstance(x, Tensor) and x.name in self._narrow:
             return self.widened(self._narrow[x.name].reshape(shape))
@@ -143,7 +143,7 @@ class _Graph:
         return out
 
     def whole(self, x: Value, shape: Sequence[int]) -> Value:
-        """With every axis as long as the trace has it."""
+        """Return the value with every axis as long as the trace has it."""
         shape = tuple(shape)
         if x.shape == shape:
             return x
@@ -152,7 +152,7 @@ class _Graph:
         return self.add("Expand", x, np.asarray(shape, np.int64), shape=shape)
 
     def transpose(self, x: Value, order: Sequence[int]) -> Value:
-        """The axes in another order; one that only moves axes of length 1 is a reshape."""
+        """Return the axes in another order; one that only moves axes of length 1 is a reshape."""
         shape = [x.shape[i] for i in order]
         if isinstance(x, Tensor) and x.name in self._narrow:
             return self.widened(np.ascontiguousarray(self._narrow[x.name].transpose(order)))
@@ -164,7 +164,7 @@ class _Graph:
         return self.add("Transpose", x, shape=shape, perm=[int(i) for i in order])
 
     def slice(self, x: Value, begin: Sequence[int], end: Sequence[int], stride: Sequence[int] | None = None) -> Value:
-        """A part of every axis."""
+        """Return a part of every axis."""
         stride = [1] * len(x.shape) if stride is None else stride
         if not isinstance(x, Tensor):
             return x[tuple(slice(*each) for each in zip(begin, end, stride, strict=True))]
@@ -176,7 +176,7 @@ class _Graph:
         return self.add("Slice", x, *parts, shape=shape)
 
     def pick(self, x: Value, places: np.ndarray) -> Value:
-        """Elements of x by their places in its order in memory: rows as long as these run on, or one slice."""
+        """Return elements of x by their places in memory: gathered in the longest rows that run on, or as one slice."""
         flat, size = places.reshape(-1), math.prod(x.shape)
         if np.any((flat < 0) | (flat >= size)):
             raise InputError("indices inside an array expected", field="--format", value="onnx", mend=MEND)
@@ -193,7 +193,7 @@ class _Graph:
         return self.reshape(found, places.shape)
 
     def finished(self, outputs: Sequence[Value], names: Sequence[str]) -> tuple[list, list]:
-        """Nodes and constants that the outputs need, these under the given names."""
+        """Return the nodes and constants that the outputs need; the outputs get the given names."""
         ends: list[tuple] = [("Identity", (self._name(x),), name, {}) for x, name in zip(outputs, names, strict=True)]
         wanted, kept = {name for end in ends for name in end[1]}, []
         for node in reversed(self._nodes):
@@ -207,18 +207,18 @@ class _Graph:
 
 
 def _read(graph: _Graph, jaxpr: core.Jaxpr, constants: Sequence[Value], inputs: Sequence[Value]) -> list[Value]:
-    """Go through a trace: constants are worked out, the rest goes into the graph."""
+    """Go through a trace: compute what is constant, put the rest into the graph, and return the results."""
     env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
 
     def value(v):
         return np.asarray(v.val, v.aval.dtype) if isinstance(v, core.Literal) else env[v]
 
     for eqn in jaxpr.eqns:
-        env.update(zip(eqn.outvars, _lowered(graph, eqn, [value(v) for v in eqn.invars]), strict=True))
+        env.update(zip(eqn.outvars, _lower(graph, eqn, [value(v) for v in eqn.invars]), strict=True))
     return [value(v) for v in jaxpr.outvars]
 
 
-def _lowered(graph: _Graph, eqn, inputs: list[Value]) -> Sequence[Value]:
+def _lower(graph: _Graph, eqn, inputs: list[Value]) -> Sequence[Value]:
     name = eqn.primitive.name
     if name in CALLS:
         inner = eqn.params[CALLS[name]]
@@ -233,7 +233,7 @@ def _lowered(graph: _Graph, eqn, inputs: list[Value]) -> Sequence[Value]:
     constants = [x for x in inputs if not isinstance(x, Tensor)]
     narrow = any(x.dtype == np.float16 for x in constants)
     if len(constants) == len(inputs) and not narrow and name not in LAZY:
-        return _worked_out(eqn, constants)
+        return _evaluate(eqn, constants)
     if name not in RULES:
         mend = f"{MEND}, or with network.descriptor = heading_free" if name in ("argmax", "atan2") else MEND
         raise InputError("operations expected that engines run", field="--format onnx", value=name, mend=mend)
@@ -241,14 +241,14 @@ def _lowered(graph: _Graph, eqn, inputs: list[Value]) -> Sequence[Value]:
     return found if isinstance(found, list) else [found]
 
 
-def _worked_out(eqn, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _evaluate(eqn, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     whole = [np.broadcast_to(x, v.aval.shape) for x, v in zip(inputs, eqn.invars, strict=True)]
     found = eqn.primitive.bind(*map(jnp.asarray, whole), **eqn.params)
     return [np.asarray(x) for x in (found if eqn.primitive.multiple_results else [found])]
 
 
 def _elementwise(operator: str) -> Callable:
-    """A rule for an operator that takes its operands as they are, axes of length 1 repeated."""
+    """Return the rule of an operator that takes its operands as they are, axes of length 1 repeated."""
 
     def rule(graph, eqn, *inputs):
         shape = np.broadcast_shapes(*(x.shape for x in inputs))
@@ -335,7 +335,7 @@ def _sum(graph, eqn, x):
 
 
 def _contracted(graph, x: Tensor, axes: list[int], shape) -> Value | None:
-    """The sum of a product over axes that both factors have, as one matrix product, where no other axis is long in both."""
+    """Return a sum of a product over axes of both factors as one matrix product; None where another axis is long in both."""
     factors = graph.factors(x)
     if factors is None or any(
         len(f.shape) != len(shape) or [f.shape[i] for i in axes] != [shape[i] for i in axes] for f in factors
@@ -362,7 +362,7 @@ def _contracted(graph, x: Tensor, axes: list[int], shape) -> Value | None:
 
 
 def _product(graph, eqn, *inputs):
-    """A matrix product, in a batch where there is one; of a constant matrix with one column, the constant on the right."""
+    """Return a matrix product, in a batch where there is one; a constant matrix times a column is turned round."""
     contracted, batched = eqn.params["dimension_numbers"]
     sides, free = [], []
     for x, v, inner, outer in zip(inputs, eqn.invars, contracted, batched, strict=True):
@@ -383,14 +383,14 @@ def _product(graph, eqn, *inputs):
 
 
 def _gather(graph, eqn, x, index):
-    """With constant indices: where each element comes from is found by gathering places."""
+    """Gather with constant indices: gathering the places tells where each element comes from."""
     x, index = graph.whole(x, eqn.invars[0].aval.shape), _constant(eqn, index, eqn.invars[1].aval.shape)
     places = jnp.arange(math.prod(x.shape), dtype=jnp.int32).reshape(x.shape)
     return graph.pick(x, np.asarray(eqn.primitive.bind(places, jnp.asarray(index), **eqn.params)))
 
 
 def _scatter(graph, eqn, x, index, new):
-    """At one constant index: a constant mask says where what is new stands, or is added."""
+    """Write or add one row at a constant index, by a constant mask."""
     x, new = (graph.whole(a, v.aval.shape) for a, v in ((x, eqn.invars[0]), (new, eqn.invars[2])))
     index, how = _constant(eqn, index, eqn.invars[1].aval.shape), {k: eqn.params[k] for k in ("dimension_numbers", "mode")}
     mask = np.asarray(lax.scatter(jnp.zeros(x.shape, bool), jnp.asarray(index), jnp.ones(new.shape, bool), **how))

@@ -11,7 +11,8 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.export.step import Exported, export
+from ncs_jax.export.facts import FileFormat
+from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
 from ncs_jax.network.rollout import animated, first_broken
@@ -86,7 +87,7 @@ class Run:
         opset: int = 15,
         motion: str | None = None,
     ) -> Exported:
-        """Write one step for hosts without this package, checked over a motion: see `export.export`.
+        """Write one step for hosts without this package, checked over a motion: see `export.write.export`.
 
         Args:
             rank: of a smaller decoder, see `compressed`. motion: to be smaller for and to check on; else the scene's first one,
@@ -101,9 +102,7 @@ class Run:
             smaller.assembly,
             smaller.params,
             file,
-            format=format,
-            float16=float16,
-            opset=opset,
+            FileFormat(format, float16, opset),
             motion=None if motion is None else self.motion(motion),
             trained=(self.assembly.network, self.params) if rank or float16 else None,
         )

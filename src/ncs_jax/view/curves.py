@@ -15,7 +15,6 @@ from ncs_jax.view.rasteriser import PAPER
 
 __all__ = ["energy_curves"]
 
-
 TERMS = {
     "membrane": "#d9643f",
     "stretch": "#d9643f",
@@ -26,13 +25,11 @@ TERMS = {
     "inertia": "#c79a2b",
     "pinning": "#7a7470",
 }
-
-
 """The energies that `energy_curves` knows, with their colours."""
 
 
 def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str | Path) -> None:
-    """Draw how training went: the total energy, its terms, and where they are known strain and penetration.
+    """Draw a training over its steps: the total energy, its terms and, where the rows have them, strain and penetration.
 
     Args:
         path: of the PNG. rows: one mapping a step, or the CSV file that holds them, with columns step, total, the terms (see
@@ -59,11 +56,11 @@ def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str |
         if name in columns:
             axes[0].plot(*columns[name], color=_hex(INK), marker="o", markersize=3.5, linewidth=1.4, label="validation")
             break
-    _dress(axes[0], "Total energy, J", [columns[n] for n in ("total", "validation_total") if n in columns])
+    _style(axes[0], "Total energy, J", [columns[n] for n in ("total", "validation_total") if n in columns])
     terms = [name for name in TERMS if name in columns and np.any(columns[name][1] != 0)]
     for name in terms:
         _curve(axes[1], columns[name], TERMS[name], name.replace("_", " "))
-    _dress(axes[1], "Its terms, J", [columns[name] for name in terms])
+    _style(axes[1], "Its terms, J", [columns[name] for name in terms])
     if quality:
         labels = {"strain": ("mean strain", "#d9643f"), "penetrating": ("penetrating vertices", "#3b7dbf")}
         for name in quality:
@@ -76,13 +73,13 @@ def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str |
                         *columns[held], color=colour, marker="o", markersize=3.5, linestyle=":", label=f"{label}, validation"
                     )
                     break
-        _dress(axes[2], "Strain and penetration, %", [], legend=2)
+        _style(axes[2], "Strain and penetration, %", [], legend=2)
         axes[2].set_ylim(bottom=0)
     figure.savefig(path, facecolor=figure.get_facecolor())
 
 
 def _columns(rows):
-    """Every column of numbers as (steps, values), without the gaps."""
+    """Return every column of numbers as (steps, values), without the gaps."""
     columns = {}
     for place, row in enumerate(rows):
         step = _number(row.get("step", place))
@@ -104,7 +101,7 @@ def _number(value):
 
 
 def _curve(axes, column, colour, label):
-    """A column, and where it is long enough to be noisy, over it a running median that is smoothed."""
+    """Draw a column; over it, where it is long enough to be noisy, a smoothed running median."""
     steps, values = column
     window = len(values) // 40 * 2 + 1
     if window < 5:
@@ -117,8 +114,8 @@ def _curve(axes, column, colour, label):
     axes.plot(steps, smooth, color=colour, linewidth=1.8, label=label)
 
 
-def _dress(axes, title, columns, legend=3):
-    """Title, legend and light axes; a log scale for what is positive and spans more than a factor of 20."""
+def _style(axes, title, columns, legend=3):
+    """Set title, legend and light axes; a log scale for what is positive and spans more than a factor of 20."""
     positive = [values[values > 0] for _, values in columns]
     every = np.concatenate(positive) if positive else np.zeros(0)
     if len(every) == sum(len(values) for _, values in columns) and len(every) and every.max() > 20 * every.min():

@@ -23,9 +23,9 @@ from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.scene.spec import load_scene
-from ncs_jax.view.preview import worn_over
+from ncs_jax.view.character import posed_body
 
-__all__ = ["COLOURS", "Shown", "View", "colour_bins", "shown", "view"]
+__all__ = ["COLOURS", "AnimatedGarment", "View", "animated_garment", "colour_bins", "vertex_values", "view"]
 
 CLOTH, SKIN, WORN, OTHER = (221, 91, 49), (176, 168, 160), (128, 153, 178), (70, 130, 180)
 BINS = 16  # colours of a scale
@@ -39,10 +39,12 @@ COLOURS = {
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What is looked at: a trained garment, an animation from a file, or a scene whose garment the body alone carries.
+class AnimatedGarment:
+    """Hold what is looked at: a trained garment, an animation from a file, or a scene whose garment only follows the skin.
 
-    motions: by name. animate(motion, alpha): vertices (frames, verts, 3), m. controlled: whether alpha does anything.
+    Attributes:
+        run: its scene, and its parameters where it is trained. motions: that it has vertices for, by name.
+        animate: (motion, alpha) -> vertices (frames, verts, 3), m. controlled: whether alpha does anything. title: of the page.
     """
 
     run: Run
@@ -52,13 +54,8 @@ class Shown:
     title: str
 
 
-@jax.jit
-def _carried(model: Model, matrices):
-    return jax.lax.map(lambda m: skin(blend(m, model.blend), model.garment.mesh.rest), matrices)
-
-
-def shown(target: str, scene: str | None = None, motion: str | None = None) -> Shown:
-    """A run folder, an animation file together with its scene and motion, or a scene.
+def animated_garment(target: str, scene: str | None = None, motion: str | None = None) -> AnimatedGarment:
+    """Open a run folder, an animation file together with its scene and motion, or a scene.
 
     Raises:
         InputError: it is none of these, or does not fit together.
@@ -67,25 +64,30 @@ def shown(target: str, scene: str | None = None, motion: str | None = None) -> S
     if path.is_dir() and (path / "run.json").exists():
         run = load_run(path)
         spec = run.assembly.scene.motion
-        return Shown(run, _named(motion, spec), run.animate, run.assembly.network.controlled, path.name)
-    named = target.startswith("ncs:") or path.suffix == ".toml"
-    if not named and scene is None:
+        return AnimatedGarment(run, _motions(motion, spec), run.animate, run.assembly.network.controlled, path.name)
+    is_scene = target.startswith("ncs:") or path.suffix == ".toml"
+    if not is_scene and scene is None:
         raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
-    loaded = load_scene(target if named else str(scene))
+    loaded = load_scene(target if is_scene else str(scene))
     run = Run(assemble(loaded.without_network()), {})
-    motions = _named(motion, loaded.motion)
-    if named:
+    motions = _motions(motion, loaded.motion)
+    if is_scene:
 
-        def carried(name: str, alpha: float) -> np.ndarray:
+        def follow_skin(name: str, alpha: float) -> np.ndarray:
             track = run.track(name)
-            return np.asarray(track.absolute(_carried(run.assembly.model, track.matrices)))
+            return np.asarray(track.absolute(_skinned_rest(run.assembly.model, track.matrices)))
 
-        return Shown(run, motions, carried, False, target)
+        return AnimatedGarment(run, motions, follow_skin, False, target)
     vertices = read_animation_over(target, run.assembly.model, run.track(motions[0]))
-    return Shown(run, motions[:1], lambda name, alpha: vertices, False, path.name)
+    return AnimatedGarment(run, motions[:1], lambda name, alpha: vertices, False, path.name)
 
 
-def _named(motion: str | None, spec) -> tuple[str, ...]:
+@jax.jit
+def _skinned_rest(model: Model, matrices):
+    return jax.lax.map(lambda m: skin(blend(m, model.blend), model.garment.mesh.rest), matrices)
+
+
+def _motions(motion: str | None, spec) -> tuple[str, ...]:
     names = (motion,) if motion else tuple(dict.fromkeys((*spec.validation, *spec.files)))
     if not names:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
@@ -99,23 +101,23 @@ def _depth(model: Model, x, matrices):
     return -triangle_distance(x, body, model.surface, index)
 
 
-def measured(
-    what: str, run: Run, vertices: np.ndarray, track: MotionFeatures, frame: int, other: np.ndarray | None
+def vertex_values(
+    name: str, run: Run, vertices: np.ndarray, track: MotionFeatures, frame: int, other: np.ndarray | None
 ) -> np.ndarray:
-    """One of `COLOURS` of every vertex in one frame (verts,), in its unit."""
+    """Return one of `COLOURS` for every vertex in one frame (verts,), in its unit; other is the overlay, if there is one."""
     model, x = run.assembly.model, vertices[frame]
-    if what == "strain":
+    if name == "strain":
         mesh = model.garment.mesh
         edges, length = np.asarray(mesh.edges), np.asarray(mesh.edge_length)
         strain = 100 * np.abs(np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1) / np.where(length > 0, length, 1) - 1)
         total = sum(np.bincount(edges[:, k], strain, len(x)) for k in (0, 1))
         return total / np.maximum(np.bincount(edges.ravel(), minlength=len(x)), 1)
-    if what.startswith("speed"):
+    if name.startswith("speed"):
         at = slice(max(frame - 1, 0), frame + 1)
         part = jax.tree.map(lambda a: a[at], track)
         u = unposed(model, vertices[at], part)
         return 1000 * model.fps * np.linalg.norm(u[-1] - u[0], axis=1)
-    if what.startswith("distance to"):
+    if name.startswith("distance to"):
         return 1000 * np.linalg.norm(x - other[frame], axis=1) if other is not None else np.zeros(len(x))
     if model.surface is None:
         return np.zeros(len(x))
@@ -126,13 +128,13 @@ def measured(
 
 
 def colour_bins(values: np.ndarray, faces: np.ndarray, most: float) -> np.ndarray:
-    """Which colour of the scale every face has (faces,), from 0 to `BINS` - 1, by the mean of its corners' values."""
+    """Return the number of every face's colour (faces,), 0 to `BINS` - 1, by the mean of its corners; `most` ends the scale."""
     share = values[faces].mean(axis=1) / most
     return np.clip((BINS * share).astype(int), 0, BINS - 1)
 
 
-def _scale(share: float) -> tuple[int, int, int]:
-    """From pale to red over orange, as on paper."""
+def _scale_colour(share: float) -> tuple[int, int, int]:
+    """Return the colour at a share of the scale, from pale over orange to red."""
     stops = np.array([[236, 231, 222], [250, 200, 120], [230, 110, 50], [150, 15, 30]], float)
     at = share * (len(stops) - 1)
     low = min(int(at), len(stops) - 2)
@@ -141,34 +143,37 @@ def _scale(share: float) -> tuple[int, int, int]:
 
 
 class View:
-    """A server whose page shows what is `shown`; `wait` keeps it playing, `close` ends it."""
+    """Serve a page that shows a garment; `wait` keeps it playing, `close` ends it."""
 
-    def __init__(self, what: Shown, overlays: dict[str, np.ndarray], *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self, subject: AnimatedGarment, overlays: dict[str, np.ndarray], *, host: str = "127.0.0.1", port: int = 8080
+    ) -> None:
         """Start serving; overlays are further animations of the first motion, by name."""
         import viser
 
-        self.what, self.overlays, self.frame, self._dirty = what, overlays, 0, True
+        self.subject, self.overlays, self.frame, self._changed = subject, overlays, 0, True
         self._closed = False
         self._player: threading.Thread | None = None
         self._lock = threading.RLock()
-        self.server = viser.ViserServer(host, port, label=what.title, verbose=False)
-        self.faces = np.asarray(what.run.assembly.garment.faces)
-        # Another alpha leaves it as it is.
-        self._worn = functools.lru_cache(1)(lambda name: worn_over(what.run.assembly, what.run.motion(name)))
-        self._stage()
-        self._panel()
+        self.server = viser.ViserServer(host, port, label=subject.title, verbose=False)
+        self.faces = np.asarray(subject.run.assembly.garment.faces)
+        run = subject.run
+        # Another alpha leaves the body as it is.
+        self._posed_body = functools.lru_cache(1)(lambda name: posed_body(run.assembly, run.motion(name)))
+        self._add_meshes()
+        self._add_controls()
         self._load()
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """Return where the page is."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
-    def _stage(self) -> None:
-        scene, body = self.server.scene, self.what.run.assembly.body
+    def _add_meshes(self) -> None:
+        scene, body = self.server.scene, self.subject.run.assembly.body
         scene.set_up_direction("+y")
         scene.add_grid("/ground", 20, 20, plane="xz", cell_size=0.5)
-        rest = self.what.run.assembly.garment.vertices
+        rest = self.subject.run.assembly.garment.vertices
         low = float(rest.min(axis=0)[1]) if body is None else float(body.vertices.min(axis=0)[1])
         tall = float(np.ptp((rest if body is None else body.vertices)[:, 1]))
         self.server.initial_camera.position = (0.6 * tall, low + 0.8 * tall, 2.0 * tall)
@@ -176,56 +181,66 @@ class View:
         self.server.initial_camera.fov = np.radians(40)
         mesh = functools.partial(scene.add_mesh_simple, side="double")
         self.cloth = mesh("/garment", rest, self.faces, color=CLOTH)
-        posed, faces, worn = self._worn(self.what.motions[0])
-        self.below = []  # the body and the garments below: their vertices, and what shows them
+        posed = self._posed_body(self.subject.motions[0])
+        self.body_meshes = []  # the body and the garments below: their vertices, and what shows them
         if posed is not None:
-            bare = posed.shape[1] - worn
-            for name, first, end, colour in (("/body", 0, bare, SKIN), ("/worn", bare, bare + worn, WORN)):
-                own = faces[(first <= faces[:, 0]) & (faces[:, 0] < end)] - first
+            end = posed.vertices.shape[1]
+            bare = end - posed.worn
+            for name, part, colour in (("/body", slice(0, bare), SKIN), ("/worn", slice(bare, end), WORN)):
+                own = posed.faces[(part.start <= posed.faces[:, 0]) & (posed.faces[:, 0] < part.stop)] - part.start
                 if len(own):
-                    self.below.append((slice(first, end), mesh(name, posed[0, first:end], own, color=colour)))
+                    self.body_meshes.append((part, mesh(name, posed.vertices[0, part], own, color=colour)))
         self.other = mesh("/overlay", rest, self.faces, color=OTHER, opacity=0.5, visible=False)
         one = np.zeros((3, 3), np.float32)
         self.bins = [
-            mesh(f"/colours/{k}", one, np.array([[0, 1, 2]]), color=_scale(k / (BINS - 1)), flat_shading=True, visible=False)
+            mesh(
+                f"/colours/{k}",
+                one,
+                np.array([[0, 1, 2]]),
+                color=_scale_colour(k / (BINS - 1)),
+                flat_shading=True,
+                visible=False,
+            )
             for k in range(BINS)
         ]
 
-    def _panel(self) -> None:
-        gui, what = self.server.gui, self.what
+    def _add_controls(self) -> None:
+        gui, subject = self.server.gui, self.subject
         self.playing = gui.add_checkbox("play", True)
         self.scrub = gui.add_slider("frame", 0, 1, 1, 0)
         self.speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
-        self.motion = gui.add_dropdown("motion", what.motions, initial_value=what.motions[0])
-        self.alpha = gui.add_slider("alpha", 0.0, 3.0, 0.05, 1.0, disabled=not what.controlled)
+        self.motion = gui.add_dropdown("motion", subject.motions, initial_value=subject.motions[0])
+        self.alpha = gui.add_slider("alpha", 0.0, 3.0, 0.05, 1.0, disabled=not subject.controlled)
         self.colour = gui.add_dropdown("colour", ("cloth", *COLOURS), initial_value="cloth")
         self.overlay = gui.add_dropdown("overlay", ("none", *self.overlays), initial_value="none", visible=bool(self.overlays))
-        self.with_body = gui.add_checkbox("body", bool(self.below), disabled=not self.below)
+        self.show_body = gui.add_checkbox("body", bool(self.body_meshes), disabled=not self.body_meshes)
         self.follow = gui.add_checkbox("keep in the middle", True)
-        self.told = gui.add_markdown("")
-        anew: tuple[Any, ...] = (self.motion, self.alpha)
-        again: tuple[Any, ...] = (self.scrub, self.colour, self.overlay, self.with_body, self.follow)
-        for handle in anew:
+        self.caption = gui.add_markdown("")
+        reload: tuple[Any, ...] = (self.motion, self.alpha)
+        redraw: tuple[Any, ...] = (self.scrub, self.colour, self.overlay, self.show_body, self.follow)
+        for handle in reload:
             handle.on_update(lambda _: self._load())
-        for handle in again:
-            handle.on_update(lambda _: self._mark())
+        for handle in redraw:
+            handle.on_update(lambda _: self._redraw())
 
-    def _mark(self) -> None:
+    def _redraw(self) -> None:
+        """Have the next round of `wait` send the frame again, that of the slider while nothing plays."""
         with self._lock:
             if not self.playing.value:
                 self.frame = int(self.scrub.value)
-            self._dirty = True
+            self._changed = True
 
     def _load(self) -> None:
-        """Animate anew: another motion, or another alpha."""
+        """Animate the chosen motion with the chosen alpha."""
         with self._lock:
-            run, name = self.what.run, self.motion.value
+            run, name = self.subject.run, self.motion.value
             self.track = run.track(name)
-            self.vertices = self.what.animate(name, float(self.alpha.value))
-            self.posed, *_ = self._worn(name)
+            self.vertices = self.subject.animate(name, float(self.alpha.value))
+            posed = self._posed_body(name)
+            self.body = posed.vertices if posed is not None else np.zeros((len(self.vertices), 0, 3), np.float32)
             self.fps = run.assembly.model.fps
             self.scrub.max = max(len(self.vertices) - 1, 1)
-            self.frame, self._dirty = self.frame % len(self.vertices), True
+            self.frame, self._changed = self.frame % len(self.vertices), True
 
     def show(self) -> None:
         """Send the present frame to the page."""
@@ -236,27 +251,27 @@ class View:
                 middle[[0, 2]] = x.mean(axis=0)[[0, 2]]
             other = self.overlays.get(self.overlay.value)
             other = other if other is not None and len(other) == len(self.vertices) else None
-            for part, shown in self.below:
-                shown.visible = bool(self.with_body.value)
-                shown.vertices = self.posed[frame, part] - middle
+            for part, drawn in self.body_meshes:
+                drawn.visible = bool(self.show_body.value)
+                drawn.vertices = self.body[frame, part] - middle
             self.other.visible = other is not None
             if other is not None:
                 self.other.vertices = other[frame] - middle
             self.cloth.visible = self.colour.value == "cloth"
             self.cloth.vertices = x - middle
-            self.told.content = self._coloured(x - middle, frame, other)
+            self.caption.content = self._coloured(x - middle, frame, other)
             if self.playing.value:
                 self.scrub.value = frame
-            self._dirty = False
+            self._changed = False
 
     def _coloured(self, x: np.ndarray, frame: int, other: np.ndarray | None) -> str:
-        """Colour the faces, and say what the colours are."""
+        """Colour the faces, and return a caption that says what the colours are."""
         name = self.colour.value
         if name == "cloth":
             for part in self.bins:
                 part.visible = False
             return f"frame {frame} of {len(self.vertices)}, {frame / self.fps:.2f} s"
-        values = measured(name, self.what.run, self.vertices, self.track, frame, other)
+        values = vertex_values(name, self.subject.run, self.vertices, self.track, frame, other)
         unit, most = COLOURS[name]
         chosen = colour_bins(values, self.faces, most)
         for k, part in enumerate(self.bins):
@@ -277,8 +292,8 @@ class View:
             began = time.monotonic()
             with self._lock:
                 if self.playing.value and len(self.server.get_clients()):
-                    self.frame, self._dirty = (self.frame + 1) % len(self.vertices), True
-            if self._dirty:
+                    self.frame, self._changed = (self.frame + 1) % len(self.vertices), True
+            if self._changed:
                 self.show()
             time.sleep(max(1 / (self.fps * self.speed.value) - (time.monotonic() - began), 0.002))
 
@@ -290,7 +305,7 @@ class View:
         self.server.stop()
 
     def _repr_html_(self) -> str:
-        """As a notebook shows it: the page, which plays until it is closed, in a browser that reaches this machine's port."""
+        """Show the page in a notebook, where it plays until it is closed; the browser has to reach this machine's port."""
         if self._player is None:
             self._player = threading.Thread(target=self.wait, daemon=True)
             self._player.start()
@@ -303,8 +318,8 @@ def view(
     """Serve a page that shows a run, an animation file with its scene, or a scene: see `View`.
 
     Args:
-        target: see `shown`. scene: of an animation file. motion: to begin with; all of the scene's can be chosen. overlays: run
-            folders or animation files of the first motion. where: host and port.
+        target: see `animated_garment`. scene: of an animation file. motion: to begin with; all of the scene's can be chosen.
+        overlays: run folders or animation files of the first motion. where: host and port.
 
     Raises:
         InputError: what is named cannot be read or does not fit, or viser, of the `view` extra, is not there.
@@ -313,12 +328,12 @@ def view(
         import viser  # noqa: F401
     except ImportError:
         raise InputError("viser is needed to look at a garment live", mend="pip install 'ncs-jax[view]'") from None
-    what = shown(target, scene, motion)
-    first = what.motions[0]
+    subject = animated_garment(target, scene, motion)
+    first = subject.motions[0]
     others = {
         Path(name).name: load_run(name).animate(first)
         if Path(name).is_dir()
-        else read_animation_over(name, what.run.assembly.model, what.run.track(first))
+        else read_animation_over(name, subject.run.assembly.model, subject.run.track(first))
         for name in overlays
     }
-    return View(what, others, **where)
+    return View(subject, others, **where)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
+from ncs_jax.view.animation import Animation
 
 __all__ = ["write_page"]
 
@@ -21,49 +22,22 @@ STEP = 5e-5
 
 
 def write_page(
-    path: str | Path,
-    animations: Mapping[str, np.ndarray],
-    garment_faces: np.ndarray,
-    body: np.ndarray | None,
-    body_faces: np.ndarray | None,
-    fps: float,
-    title: str,
-    facts: Mapping[str, str],
-    worn: int = 0,
+    path: str | Path, animations: Mapping[str, Animation], *, title: str = "", facts: Mapping[str, str] | None = None
 ) -> None:
     """Write one HTML file that plays a garment on a body in any browser with WebGL 2; it loads nothing from elsewhere.
 
     Args:
-        path: of the page. animations: vertices (T, V, 3) in m with Y up, by motion alpha such as "0", "1", "1.5"; if there is
-        just one, no switch is shown. garment_faces: (F, 3). body: vertices (T, B, 3) in m, or None. body_faces: its faces, or
-        None. fps: frames per second. title: of the page. facts: figures shown beneath it, by name. worn: how many of the
-        body's vertices, the last, are of garments worn below, whose faces come last.
+        path: of the page. animations: by motion alpha such as "0", "1", "1.5", alike but for the garment's vertices; if
+            there is just one, no switch is shown. title: of the page. facts: figures shown beneath it, by name.
 
     Positions are kept to 0.03 mm wherever the garment walks (`test_positions_survive`); a frame that spans more than 3.2 m is
-    kept to its span over 130,000. What is not finite, or does not fit together, is an `InputError`.
+    kept to its span over 130,000.
+
+    Raises:
+        InputError: a position is not finite, or the animations differ by more than the garment's vertices.
     """
-    if not animations:
-        raise InputError("at least one animation", field="animations")
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("frames per second above 0", field="fps", value=fps)
-    garments = {label: _vertices(x, f"animations[{label!r}]") for label, x in animations.items()}
-    first, shape = next((label, x.shape) for label, x in garments.items())
-    for label, x in garments.items():
-        if x.shape != shape:
-            raise InputError(f"shape {shape}, as animations[{first!r}] has", field=f"animations[{label!r}]", value=x.shape)
-    tracks = [_track(x) for x in garments.values()]
-    data = {f"track-{i}": payload for i, (_, payload) in enumerate(tracks)}
-    scene: dict[str, object] = {"fps": float(fps), "frames": shape[0], "labels": list(garments)}
-    scene["garment"] = {"verts": shape[1], "tracks": [record for record, _ in tracks]}
-    data["garment-faces"] = _faces(garment_faces, shape[1], "garment_faces")
-    if body is not None:
-        body = _vertices(body, "body")
-        if len(body) != shape[0]:
-            raise InputError(f"{shape[0]} frames, as many as the garment has", field="body", value=len(body))
-        record, data["track-body"] = _track(body)
-        scene["body"] = {"verts": body.shape[1], "worn": worn, "tracks": [record]}
-        data["body-faces"] = _faces(body_faces, body.shape[1], "body_faces")
-    rows = (f"<div><dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd></div>" for k, v in facts.items())
+    scene, data = _scene(_checked(animations))
+    rows = (f"<div><dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd></div>" for k, v in (facts or {}).items())
     blocks = (f'<script type="application/octet-stream" id="{name}">{text}</script>' for name, text in data.items())
     parts = {
         "TITLE": html.escape(str(title)),
@@ -76,11 +50,52 @@ def write_page(
     Path(path).write_text(page, encoding="utf-8", newline="\n")
 
 
-def _vertices(vertices, name):
-    """Finite vertices (T, V, 3)."""
-    vertices = np.asarray(vertices)
-    if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
-        raise InputError("vertices of shape (frames, verts, 3)", field=name, value=vertices.shape)
+def _scene(animations: dict[str, Animation]) -> tuple[dict[str, object], dict[str, str]]:
+    """Return what the page's script reads: the facts of the scene, and its blocks of data by name."""
+    first = next(iter(animations.values()))
+    frames, verts, _ = first.garment.shape
+    tracks = [_track(each.garment) for each in animations.values()]
+    data = {f"track-{i}": payload for i, (_, payload) in enumerate(tracks)}
+    scene: dict[str, object] = {"fps": float(first.fps), "frames": frames, "labels": list(animations)}
+    scene["garment"] = {"verts": verts, "tracks": [record for record, _ in tracks]}
+    data["garment-faces"] = _faces(first.garment_faces)
+    if first.body is not None:
+        record, data["track-body"] = _track(first.body.vertices)
+        scene["body"] = {"verts": first.body.vertices.shape[1], "worn": first.body.worn, "tracks": [record]}
+        data["body-faces"] = _faces(first.body.faces)
+    return scene, data
+
+
+def _checked(animations: Mapping[str, Animation]) -> dict[str, Animation]:
+    """Return the animations with Y up, checked to be finite and alike."""
+    if not animations:
+        raise InputError("at least one animation", field="animations")
+    label, first = next(iter(animations.items()))
+    for name, each in animations.items():
+        field = f"animations[{name!r}]"
+        if each.garment.shape != first.garment.shape:
+            raise InputError(
+                f"shape {first.garment.shape}, as animations[{label!r}] has", field=field, value=each.garment.shape
+            )
+        if not _alike(each, first):
+            raise InputError(f"faces, body, frame rate and up as animations[{label!r}] has", field=field)
+        _check_finite(each.garment, field)
+    if first.body is not None:
+        _check_finite(first.body.vertices, "body")
+    return {name: each.y_up() for name, each in animations.items()}
+
+
+def _alike(one: Animation, other: Animation) -> bool:
+    """Tell whether two animations differ by the garment's vertices alone."""
+    if (one.fps, tuple(one.up)) != (other.fps, tuple(other.up)) or not np.array_equal(one.garment_faces, other.garment_faces):
+        return False
+    a, b = one.body, other.body
+    if a is b or a is None or b is None:
+        return a is b
+    return a.worn == b.worn and np.array_equal(a.faces, b.faces) and np.array_equal(a.vertices, b.vertices)
+
+
+def _check_finite(vertices: np.ndarray, name: str) -> None:
     bad = np.argwhere(~np.isfinite(vertices).all(2))
     if len(bad):
         frame, vertex = bad[0].tolist()
@@ -88,21 +103,15 @@ def _vertices(vertices, name):
         raise InputError(f"finite positions, but vertex {vertex} of frame {frame} is not", field=name, value=value)
     if np.abs(vertices).max() > 1e6:
         raise InputError("positions in m, within 1e6", field=name, value=float(np.abs(vertices).max()))
-    return vertices
 
 
-def _faces(faces, count, name):
-    """Triangles as base64 of deflated little-endian int32."""
-    faces = np.asarray(faces)
-    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-        raise InputError("whole numbers of shape (faces, 3)", field=name, value=(faces.shape, str(faces.dtype)))
-    if faces.size and (faces.min() < 0 or faces.max() >= count):
-        raise InputError(f"vertex numbers from 0 to {count - 1}", field=name, value=(int(faces.min()), int(faces.max())))
+def _faces(faces: np.ndarray) -> str:
+    """Return triangles as base64 of deflated little-endian int32."""
     return _text(faces.astype("<i4").tobytes())
 
 
 def _track(vertices):
-    """Where the numbers lie, and the positions themselves.
+    """Return where the numbers lie, and the positions themselves.
 
     Each frame is its mean, a float32, and for each axis and vertex a uint16 on a grid around it. These are stored as second
     differences in time modulo 65536, low bytes first: a smooth motion has small ones, which deflate to a quarter.

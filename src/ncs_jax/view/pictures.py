@@ -1,4 +1,4 @@
-"""Pictures of an animated garment: a contact sheet, an animated GIF, and the curves of its training.
+"""Pictures of an animated garment: a contact sheet and an animated GIF.
 
 No graphics card, display or browser is needed. Everything is drawn in metres with Y up; what has another up is turned first.
 """
@@ -16,82 +16,62 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import cKDTree
 
-from ncs_jax.errors import InputError
-from ncs_jax.view.rasteriser import PAPER, Camera, DrawnMesh, Ground, render
+from ncs_jax.view.animation import Animation
+from ncs_jax.view.camera import Camera
+from ncs_jax.view.ground import Ground
+from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
-__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet", "upright"]
-
+__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet"]
 
 _ROWS = ("front", "side")
 VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
-
-
 """Azimuth of a named view in degrees, turning from +Z, which characters face, towards +X."""
-
 
 CLOTH, CLOTH_INSIDE = (0.90, 0.47, 0.33), (0.55, 0.25, 0.28)
 BODY, WORN = (0.80, 0.765, 0.73), (0.50, 0.60, 0.70)
 INK, FAINT = (46, 42, 40), (142, 135, 128)
 
 
-def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.ndarray:
-    """Turn (..., 3) so that `up` becomes +Y, the shortest way: Z up facing -Y becomes Y up facing +Z."""
-    u = np.asarray(up, float)
-    length = np.linalg.norm(u)
-    if u.shape != (3,) or not np.isfinite(length) or length == 0:
-        raise InputError("a direction of three numbers, not all zero", field="up", value=up)
-    u = u / length
-    if u[1] > 1 - 1e-12:
-        return np.asarray(vertices)
-    if u[1] < -1 + 1e-12:
-        turn = np.diag([1.0, -1.0, -1.0])
-    else:
-        v = np.cross(u, [0.0, 1.0, 0.0])
-        k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-        turn = np.eye(3) + k + k @ k / (1 + u[1])
-    return (np.asarray(vertices) @ turn.T).astype(np.asarray(vertices).dtype)
-
-
 @dataclass(frozen=True)
 class _Stage:
-    """An animation made ready to be drawn: turned upright, with the camera's path and what it must hold."""
+    """Hold an animation with Y up, the camera's path (frames, 3), half of what it must show (3,), and the floor, m."""
 
-    garment: np.ndarray
-    garment_faces: np.ndarray
-    body: np.ndarray | None
-    body_faces: np.ndarray | None
-    worn: int
+    animation: Animation
     path: np.ndarray
     half: np.ndarray
     floor: float
 
+    @property
+    def frames(self) -> int:
+        return len(self.animation.garment)
+
     def meshes(self, frame: int) -> list[DrawnMesh]:
-        drawn = [DrawnMesh(self.garment[frame], self.garment_faces, CLOTH, CLOTH_INSIDE)]
-        if self.body is not None and self.body_faces is not None:
-            x = self.body[frame]
-            drawn.append(DrawnMesh(x, self.body_faces, np.repeat([BODY, WORN], [len(x) - self.worn, self.worn], axis=0)))
+        garment, body = self.animation.garment[frame], self.animation.body
+        drawn = [DrawnMesh(garment, self.animation.garment_faces, CLOTH, CLOTH_INSIDE)]
+        if body is not None:
+            x = body.vertices[frame]
+            drawn.append(DrawnMesh(x, body.faces, np.repeat([BODY, WORN], [len(x) - body.worn, body.worn], axis=0)))
         return drawn
 
     def ground(self, frame: int, radius: float) -> Ground:
         return Ground(self.floor, (self.path[frame, 0], self.path[frame, 2]), radius)
 
-    def _points(self, frame: int) -> np.ndarray:
-        points = self.garment[frame] if self.body is None else np.concatenate([self.garment[frame], self.body[frame]])
-        return points[_sane(points).all(1)]
-
     def heading(self, frame: int) -> float:
-        """How far the character has turned about Y since the first frame, degrees: the best fit in the plane of x and z."""
-        both = self.garment if self.body is None else self.body
-        first, now = both[0], both[frame]
-        good = _sane(first).all(1) & _sane(now).all(1)
+        """Return how far the character has turned about Y since the first frame, degrees: the best fit in x and z."""
+        body = self.animation.body
+        x = self.animation.garment if body is None else body.vertices
+        first, now = x[0], x[frame]
+        good = _drawable(first).all(1) & _drawable(now).all(1)
         if not good.any():
             return 0.0
-        (x0, _, z0), (x, _, z) = (first[good] - first[good].mean(0)).T, (now[good] - now[good].mean(0)).T
-        return math.degrees(math.atan2((x * z0 - z * x0).sum(), (x * x0 + z * z0).sum()))
+        (x0, _, z0), (x1, _, z1) = (first[good] - first[good].mean(0)).T, (now[good] - now[good].mean(0)).T
+        return math.degrees(math.atan2((x1 * z0 - z1 * x0).sum(), (x1 * x0 + z1 * z0).sum()))
 
-    def frame_up(self, frame: int, azimuth: float) -> tuple[np.ndarray, float, float, float]:
-        """The middle (x, z) of a frame as seen from an azimuth, its lowest and highest y, and its width, m."""
-        points = self._points(frame)
+    def bounds(self, frame: int, azimuth: float) -> tuple[np.ndarray, float, float, float]:
+        """Return the middle (x, z) of a frame as seen from an azimuth, its lowest and highest y, and its width, m."""
+        garment, body = self.animation.garment[frame], self.animation.body
+        points = garment if body is None else np.concatenate([garment, body.vertices[frame]])
+        points = points[_drawable(points).all(1)]
         if not len(points):
             return self.path[frame, [0, 2]], self.floor, self.floor + 1.0, 1.0
         a = math.radians(azimuth)
@@ -104,46 +84,32 @@ class _Stage:
         return turn.T @ (low + high) / 2, min(float(y.min()), self.floor), float(y.max()), float(size[0])
 
 
-def _sane(vertices):
-    """Which coordinates can be shown."""
+def _drawable(vertices):
+    """Tell which coordinates can be drawn: finite, and not blown up."""
     return np.abs(np.where(np.isfinite(vertices), vertices, np.inf)) < 1e3
 
 
-def _stage(garment, garment_faces, body, body_faces, fps, up, worn=0):
-    """Check and turn an animation, and find the camera's path."""
-    garment = _sequence(garment, "garment", up)
-    if body is not None:
-        if body_faces is None:
-            raise InputError("the body's faces (F, 3)", field="body_faces")
-        body = _sequence(body, "body", up)
-        if len(body) != len(garment):
-            raise InputError(f"{len(garment)} frames, as many as the garment has", field="body", value=len(body))
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("frames per second above 0", field="fps", value=fps)
-    path, low, high = _track(garment if body is None else body, fps)
+def _stage(animation: Animation) -> _Stage:
+    """Turn an animation upright, and find the camera's path."""
+    animation = animation.y_up()
+    garment, body, fps = animation.garment, animation.body, animation.fps
+    path, low, high = _camera_path(garment if body is None else body.vertices, fps)
     # 5 % of the height more than the character, and room for what swings.
     relative_low, relative_high = (low - path).min(0), (high - path).max(0)
     if body is not None:
-        _, cloth_low, cloth_high = _track(garment, fps)
+        _, cloth_low, cloth_high = _camera_path(garment, fps)
         relative_low = np.minimum(relative_low, np.maximum((cloth_low - path).min(0), -2.0))
         relative_high = np.maximum(relative_high, np.minimum((cloth_high - path).max(0), 2.0))
     middle = (relative_low[1] + relative_high[1]) / 2
     path = path + np.array([0.0, middle, 0.0])
     half = np.maximum((relative_high - relative_low) / 2, 0.05)
     half[[0, 2]] = np.maximum(np.abs(relative_low), np.abs(relative_high))[[0, 2]]
-    return _Stage(garment, garment_faces, body, body_faces, worn, path, half, float(low[:, 1].min()))
+    return _Stage(animation, path, half, float(low[:, 1].min()))
 
 
-def _sequence(vertices, name, up):
-    vertices = np.asarray(vertices)
-    if vertices.ndim != 3 or vertices.shape[2] != 3 or not len(vertices):
-        raise InputError("vertices of shape (frames, verts, 3)", field=name, value=vertices.shape)
-    return upright(vertices, up)
-
-
-def _track(vertices, fps):
-    """A smooth path (T, 3) that follows x and z of vertices (T, V, 3) at a steady height, and their bounds by frame (T, 3)."""
-    good = _sane(vertices)
+def _camera_path(vertices, fps):
+    """Return a smooth path (T, 3) that follows x and z of vertices (T, V, 3) at a steady height, and their bounds by frame."""
+    good = _drawable(vertices)
     some = good.all(2).any(1)
     if not some.any():
         zero = np.zeros((len(vertices), 3))
@@ -168,41 +134,28 @@ def _font(size):
 
 
 def contact_sheet(
-    path: str | Path,
-    garment: np.ndarray,
-    garment_faces: np.ndarray,
-    body: np.ndarray | None,
-    body_faces: np.ndarray | None,
-    fps: float,
-    *,
-    frames: int = 8,
-    up: Sequence[float] = (0.0, 1.0, 0.0),
-    tile: int = 520,
-    labels: Sequence[str] = (),
-    worn: int = 0,
+    path: str | Path, animation: Animation, *, frames: int = 8, tile: int = 520, labels: Sequence[str] = ()
 ) -> None:
     """Write a PNG of several moments of an animation, from the character's front and side; the camera turns with it.
 
     Args:
-        path: of the PNG. garment: vertices (T, V, 3) in m. garment_faces: (F, 3). body: vertices (T, B, 3) in m, or None.
-        body_faces: its faces, or None. fps: frames per second. frames: how many moments, evenly spread. up: the world's up.
-        tile: height of one picture in pixels. labels: of the moments; without them the time of each. worn: how many of the
-        body's vertices, the last, are of garments worn below.
+        path: of the PNG. animation: to draw. frames: how many moments, evenly spread. tile: height of one picture in pixels.
+        labels: of the moments; without them the time of each.
     """
-    stage = _stage(garment, garment_faces, body, body_faces, fps, up, worn)
-    chosen = np.unique(np.linspace(0, len(stage.garment) - 1, max(1, frames)).round().astype(int)).tolist()
-    turns = [stage.heading(frame) for frame in chosen]
-    shots = [[stage.frame_up(frame, turn + VIEWS[view]) for frame, turn in zip(chosen, turns, strict=True)] for view in _ROWS]
-    low, high = min(shot[1] for row in shots for shot in row), max(shot[2] for row in shots for shot in row)
+    stage = _stage(animation)
+    chosen = np.unique(np.linspace(0, stage.frames - 1, max(1, frames)).round().astype(int)).tolist()
+    headings = [stage.heading(frame) for frame in chosen]
+    bounds = [[stage.bounds(frame, turn + VIEWS[view]) for frame, turn in zip(chosen, headings, strict=True)] for view in _ROWS]
+    low, high = min(each[1] for row in bounds for each in row), max(each[2] for row in bounds for each in row)
     tall = 1.10 * (high - low)
-    wide = 1.10 * max(shot[3] for row in shots for shot in row)
+    wide = 1.10 * max(each[3] for row in bounds for each in row)
     width = round(tile * min(max(wide / tall, 0.40), 1.3))
     margin, label = 56, 40
     sheet = Image.new("RGB", (2 * margin + width * len(chosen), 2 * tile + 2 * label + margin), PAPER)
     draw = ImageDraw.Draw(sheet)
     for row, view in enumerate(_ROWS):
         top = label + row * tile
-        for column, (frame, turn, (middle, *_)) in enumerate(zip(chosen, turns, shots[row], strict=True)):
+        for column, (frame, turn, (middle, *_)) in enumerate(zip(chosen, headings, bounds[row], strict=True)):
             target = (middle[0], (low + high) / 2, middle[1])
             camera = Camera(target, tall, wide, turn + VIEWS[view], elevation=7.0)
             ground = Ground(stage.floor, middle, max(0.75, 0.55 * tall * width / tile), cell=0)
@@ -213,36 +166,29 @@ def contact_sheet(
         sheet.paste(FAINT, (8, top), text.rotate(90, expand=True))
     for column, frame in enumerate(chosen):
         x = margin + (column + 0.5) * width
-        below = labels[column] if labels else f"{frame / fps:.2f} s"
+        below = labels[column] if labels else f"{frame / animation.fps:.2f} s"
         draw.text((x, label + 2 * tile + 22), below, INK, _font(22), "mm")
     sheet.save(path, optimize=True)
 
 
 def animation_gif(
     path: str | Path,
-    garment: np.ndarray,
-    garment_faces: np.ndarray,
-    body: np.ndarray | None,
-    body_faces: np.ndarray | None,
-    fps: float,
+    animation: Animation,
     *,
     max_frames: int = 120,
     size: tuple[int, int] = (360, 450),
-    up: Sequence[float] = (0.0, 1.0, 0.0),
     view: str = "three-quarter",
     max_bytes: int = 6_000_000,
-    worn: int = 0,
 ) -> None:
     """Write an animated GIF that follows the character over a fixed grid, at 15 frames per second or what comes closest.
 
     Args:
-        path: of the GIF. garment, garment_faces, body, body_faces, fps, up, worn: see `contact_sheet`. max_frames: of the GIF;
-        a longer animation is cut there. size: width and height in pixels. view: one of `VIEWS`. max_bytes: colours and then
-        frames are dropped until it is no larger.
+        path: of the GIF. animation: to draw. max_frames: of the GIF; a longer animation is cut there. size: width and height in
+            pixels. view: one of `VIEWS`. max_bytes: colours and then frames are dropped until it is no larger.
     """
-    stage = _stage(garment, garment_faces, body, body_faces, fps, up, worn)
+    stage, fps = _stage(animation), animation.fps
     stride = max(1, math.floor(fps / 15 + 0.5))
-    chosen = np.arange(0, len(stage.garment), stride)[: max(1, max_frames)]
+    chosen = np.arange(0, stage.frames, stride)[: max(1, max_frames)]
     half = math.hypot(stage.half[0], stage.half[2]) if view not in ("front", "back") else stage.half[0]
     camera = Camera(stage.path[0], 2 * stage.half[1] * 1.16, 2 * half * 0.92, VIEWS[view], elevation=12.0)
 
@@ -261,7 +207,7 @@ def animation_gif(
 
 
 def _write_gif(path, pictures, seconds, colours):
-    """One palette for all frames, chosen from several of them, so that nothing flickers."""
+    """Write the frames with one palette for all, chosen from several of them, so that nothing flickers."""
     few = np.concatenate([np.asarray(picture).reshape(-1, 3) for picture in pictures[:: max(1, len(pictures) // 6)]])
     # Each colour once: by area, the wide floor would take them all and leave the cloth flat.
     each = np.unique(few >> 2, axis=0) * 4 + 1

@@ -1,0 +1,117 @@
+"""The record that pictures and pages draw: a garment's vertices over time, on a posed body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+
+__all__ = ["Animation", "PosedBody", "upright"]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBody:
+    """Hold what a garment is worn on, over a motion.
+
+    Attributes:
+        vertices: (frames, body, 3), m. faces: (faces, 3).
+        worn: how many of the vertices, the last, are of garments worn below, whose faces come last too.
+
+    Raises:
+        InputError: the shapes do not fit together.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    worn: int = 0
+
+    def __post_init__(self) -> None:
+        """Check what was given."""
+        object.__setattr__(self, "vertices", _vertices(self.vertices, "body"))
+        object.__setattr__(self, "faces", _faces(self.faces, self.vertices.shape[1], "body_faces"))
+        if not 0 <= self.worn <= self.vertices.shape[1]:
+            raise InputError(f"0 to {self.vertices.shape[1]} vertices of the body", field="worn", value=self.worn)
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """Hold what pictures and pages draw: a garment over time, and the body that it is worn on.
+
+    `view.character.animation_of` makes one from a run and a motion. Vertices may be NaN: a picture leaves them out.
+
+    Attributes:
+        garment: vertices (frames, verts, 3), m. garment_faces: (faces, 3). fps: frames per second.
+        body: of as many frames, or None. up: the world's up, as three numbers; its length does not matter.
+
+    Raises:
+        InputError: the shapes or frames do not fit together, or a number is not usable.
+    """
+
+    garment: np.ndarray
+    garment_faces: np.ndarray
+    fps: float
+    body: PosedBody | None = None
+    up: Sequence[float] = (0.0, 1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check what was given."""
+        object.__setattr__(self, "garment", _vertices(self.garment, "garment"))
+        object.__setattr__(self, "garment_faces", _faces(self.garment_faces, self.garment.shape[1], "garment_faces"))
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise InputError("frames per second above 0", field="fps", value=self.fps)
+        if self.body is not None and len(self.body.vertices) != len(self.garment):
+            raise InputError(
+                f"{len(self.garment)} frames, as many as the garment has", field="body", value=len(self.body.vertices)
+            )
+        _unit(self.up)
+
+    def y_up(self) -> Animation:
+        """Return this animation turned so that +Y is up."""
+        body = None if self.body is None else replace(self.body, vertices=upright(self.body.vertices, self.up))
+        return replace(self, garment=upright(self.garment, self.up), body=body, up=(0.0, 1.0, 0.0))
+
+    def until(self, end: int | None) -> Animation:
+        """Return the frames before `end`, all for None."""
+        body = None if self.body is None else replace(self.body, vertices=self.body.vertices[:end])
+        return replace(self, garment=self.garment[:end], body=body)
+
+
+def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.ndarray:
+    """Turn (..., 3) so that `up` becomes +Y, the shortest way: Z up facing -Y becomes Y up facing +Z."""
+    u = _unit(up)
+    if u[1] > 1 - 1e-12:
+        return np.asarray(vertices)
+    if u[1] < -1 + 1e-12:
+        turn = np.diag([1.0, -1.0, -1.0])
+    else:
+        v = np.cross(u, [0.0, 1.0, 0.0])
+        k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+        turn = np.eye(3) + k + k @ k / (1 + u[1])
+    return (np.asarray(vertices) @ turn.T).astype(np.asarray(vertices).dtype)
+
+
+def _unit(up: Sequence[float]) -> np.ndarray:
+    u = np.asarray(up, float)
+    length = np.linalg.norm(u)
+    if u.shape != (3,) or not np.isfinite(length) or length == 0:
+        raise InputError("a direction of three numbers, not all zero", field="up", value=up)
+    return u / length
+
+
+def _vertices(vertices, name: str) -> np.ndarray:
+    vertices = np.asarray(vertices)
+    if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
+        raise InputError("vertices of shape (frames, verts, 3)", field=name, value=vertices.shape)
+    return vertices
+
+
+def _faces(faces, count: int, name: str) -> np.ndarray:
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise InputError("whole numbers of shape (faces, 3)", field=name, value=(faces.shape, str(faces.dtype)))
+    if faces.size and (faces.min() < 0 or faces.max() >= count):
+        raise InputError(f"vertex numbers from 0 to {count - 1}", field=name, value=(int(faces.min()), int(faces.max())))
+    return faces

@@ -1,0 +1,59 @@
+"""The posed character that a garment is drawn on: its body, and the garments worn below."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.geometry.rotations import axis_angle_to_matrix
+from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.network.rollout import animated
+from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.view.animation import Animation, PosedBody
+
+__all__ = ["animation_of", "body_vertices", "posed_body"]
+
+
+def animation_of(assembly: Assembly, motion: io.MotionRecord, vertices: np.ndarray) -> Animation:
+    """Return a garment as pictures and pages draw it, on the character that wears it.
+
+        contact_sheet("sheet.png", animation_of(run.assembly, run.motion(name), run.animate(name)))
+
+    Args:
+        assembly: of the garment, such as `run.assembly`. motion: that the garment was animated over.
+        vertices: of the garment over the motion (frames, verts, 3), m.
+
+    Raises:
+        InputError: the vertices do not fit: see `Animation`.
+    """
+    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, motion))
+
+
+def posed_body(assembly: Assembly, motion: io.MotionRecord) -> PosedBody | None:
+    """Return the body and the garments worn below over a motion as one mesh, the garments last; None without a body."""
+    if assembly.body is None:
+        return None
+    vertices, faces = [body_vertices(assembly.body, motion)], [assembly.body.faces]
+    for layer in assembly.model.under:
+        faces.append(np.asarray(layer.model.garment.mesh.faces) + sum(v.shape[1] for v in vertices))
+        vertices.append(animated(layer.model, layer.network, layer.params, features_from_records(layer.model, motion)))
+    worn = sum(v.shape[1] for v in vertices[1:])
+    return PosedBody(np.concatenate(vertices, axis=1), np.concatenate(faces), worn)
+
+
+def body_vertices(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
+    """Return the whole body's vertices over a motion, (frames, body, 3) in m."""
+    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
+    weights, rest = blend_from(body.weights), jnp.asarray(body.vertices, jnp.float32)
+    local = axis_angle_to_matrix(jnp.asarray(motion.poses, jnp.float32))
+    if body.rest_rotations is not None:
+        local = to_rest_axes(local, jnp.asarray(body.rest_rotations, jnp.float32))
+
+    @jax.jit
+    def skinned(local, translation):
+        matrices = transforms(skeleton, forward(skeleton, local, translation))
+        return jax.lax.map(lambda m: skin(blend(m, weights), rest), matrices)
+
+    return np.asarray(skinned(local, jnp.asarray(motion.translation, jnp.float32)))
