@@ -68,8 +68,8 @@ def energies_and_gradient(
     step = replace(step, force=None)
     if not alone.own:  # which may read all of it
         step = _needed(step, alone)
-    dt = step.dt
-    one = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, replace(step, dt=None)))
+    dt = step.dt  # the same in all poses
+    one = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, replace(step, dt=jnp.zeros(x.shape[-1:], x.dtype))))
     some, slope, to_transforms = lax.map(lambda one: each((one[0], replace(one[1], dt=dt))), one)
     to_transforms = None if to_transforms is None else jnp.moveaxis(to_transforms, 0, -1)
     return parts | some, gradient + jnp.moveaxis(slope, 0, -1), to_transforms

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import jax
 from jaxtyping import Array, Float, Int
@@ -48,8 +49,17 @@ NAMES = (
     "total",
 )
 
-OwnTerm = Callable[[Array, "StepInputs"], Array]
-"""A term that the package does not know: `term(x, step) -> energy` in J, differentiable, called by its `__name__`."""
+
+class OwnTerm(Protocol):
+    """A term of one's own: a pure function `term(x, step)` that returns an energy in J and is differentiable by x.
+
+    x: positions (verts, 3) in m. step: the model's `StepInputs` of one pose. It is known by its `__name__`.
+    """
+
+    __name__: str
+
+    def __call__(self, x: Float[Array, "verts 3"], step: StepInputs) -> Float[Array, ""]:
+        """Return the energy, J."""
 
 
 @dataclass(frozen=True)

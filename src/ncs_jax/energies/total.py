@@ -93,9 +93,8 @@ def energies(
     but for `through_time`. `elements.energies_and_gradient` is the fast path, equal to this one for every combination of terms.
     Source: slides, equation (10).
     """
-    mesh = garment.mesh
+    mesh, parts = garment.mesh, {}
     mass = material.density * mesh.vertex_area
-    parts = {}
     if terms.membrane is not None:
         with jax.named_scope("membrane"):
             parts["membrane"] = MEMBRANES[terms.membrane][0](x, mesh, *material.membrane)

@@ -12,7 +12,7 @@ from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import energies
 from ncs_jax.geometry.skinning import Blend, blend
-from ncs_jax.network.methods.method import Method, Windows, decode, garment_blend
+from ncs_jax.network.methods.method import Method, Offsets, Windows, decode, garment_blend
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_garment, posed_bodies
 from ncs_jax.scene.step_inputs import Past, step_inputs
@@ -100,7 +100,7 @@ def gradients(model: Model, network: Method, params, track: MotionFeatures, wind
     if model.terms.through_time:
         past, more = _through_time(model, weights, offsets, matrices, moving)
         by_frame, to_weights = by_frame + past, jax.tree.map(jnp.add, to_weights, more)
-    (result,) = transpose(([g / size for g in by_frame], to_extra))
+    (result,) = transpose(Offsets([g / size for g in by_frame], to_extra))
     if network.learn_weights:
         (more,) = pull(jax.tree.map(lambda w: w / size, to_weights))
         result = jax.tree.map(jnp.add, result, more)

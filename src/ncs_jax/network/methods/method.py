@@ -80,8 +80,11 @@ class Kept(NamedTuple):
     swing: Array | None = None  # q of the last frames (batch, modes)
 
 
-Offsets = tuple[list[Array], Array | None]
-"""Offsets (verts, 3, batch) of frames, the last first, and one more array (verts, 3, batch) that a method's coupling reads."""
+class Offsets(NamedTuple):
+    """What a step differentiates, in unposed space, m."""
+
+    frames: list[Array]  # (verts, 3, batch) of each frame, the last first
+    extra: Array | None = None  # (verts, 3, batch) that the method's coupling reads
 
 
 @runtime_checkable
@@ -198,9 +201,9 @@ def window_offsets(
         mixed = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, others])
         z = jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
     if not model.terms.through_time:
-        return ([decode(network, params, model, z[-1])], None), Kept(z)
+        return Offsets([decode(network, params, model, z[-1])]), Kept(z)
     every = decode(network, params, model, z)
-    return ([every[:, :, k] for k in (2, 1, 0)], None), Kept(z)
+    return Offsets([every[:, :, k] for k in (2, 1, 0)]), Kept(z)
 
 
 def no_coupling(model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:

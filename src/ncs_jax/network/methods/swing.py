@@ -156,7 +156,8 @@ class Swing:
         offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
         offsets, static = jnp.split(offsets, 2, axis=-1)
         moved = offsets - lax.stop_gradient(static)
-        return ([offsets + jnp.tensordot(model.vibrations.directions, q, (-1, -1))], moved), Kept(z[None], q)
+        frames = [offsets + jnp.tensordot(model.vibrations.directions, q, (-1, -1))]
+        return Offsets(frames, moved), Kept(z[None], q)
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return the energy `hold` of what the dynamic code adds to the offsets, and its derivative."""
