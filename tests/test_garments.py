@@ -14,7 +14,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import upright
 from ncs_jax.io.mesh.polygons import triangulate
 from ncs_jax.io.mesh.surface import summarise_surface
-from ncs_jax.prepare.garment_checks import check_worn
+from ncs_jax.prepare.garment_checks import check_on_body
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube
@@ -316,11 +316,11 @@ def test_units_and_axes_are_recognised_and_the_mend_holds(tmp_path, unit, up):
     fields = [f"scale = {1 / unit:.4g}"] * (unit != 1) + [f'up = "{up}"'] * (up != "y")
     if fields:
         with pytest.raises(InputError) as caught:
-            check_worn(tmp_path / "g.npz", io.read_garment(tmp_path / "g.npz"), body, told=False)
+            check_on_body(tmp_path / "g.npz", io.read_garment(tmp_path / "g.npz"), body, axis_given=False)
         assert f"write {' and '.join(fields)} below [garment]" in str(caught.value) and "\n" not in str(caught.value)
     read = io.read_garment(tmp_path / "g.npz", scale=0.0 if unit == 1 else 1 / unit, up="" if up == "y" else up)
     np.testing.assert_allclose(read.vertices, x, atol=1e-12)
-    check_worn(tmp_path / "g.npz", read, body, told=False)
+    check_on_body(tmp_path / "g.npz", read, body, axis_given=False)
 
 
 def test_the_command_tells_the_mend_and_then_what_was_applied(tmp_path, capsys):
@@ -338,21 +338,21 @@ def test_a_garment_across_the_body_is_refused_unless_the_scene_says_so():
     """A body about the origin, which a garment that lies down still touches: there the axis that is up must be told."""
     body = post()["vertices"] - [0, 0.5, 0]
     x = grid(rows=9, spacing=0.05)[0] - [0, 0.5, 0]
-    check_worn(Path("g.npz"), garment(x), body, told=False)
+    check_on_body(Path("g.npz"), garment(x), body, axis_given=False)
     lies = x @ np.array(TURNED["z"])
     with pytest.raises(InputError, match=r'g\.npz: .*it would with Z up .found .Y up.*write up = "z" .* or up = "y"'):
-        check_worn(Path("g.npz"), garment(lies), body, told=False)
-    check_worn(Path("g.npz"), garment(lies), body, told=True)
+        check_on_body(Path("g.npz"), garment(lies), body, axis_given=False)
+    check_on_body(Path("g.npz"), garment(lies), body, axis_given=True)
     with pytest.raises(InputError, match="with Y up"):  # a file of USD that says Z up and is not
-        check_worn(Path("g.npz"), garment(upright(x, 1.0, "z"), up="z"), body, told=False)
+        check_on_body(Path("g.npz"), garment(upright(x, 1.0, "z"), up="z"), body, axis_given=False)
 
 
 def test_a_garment_that_nothing_brings_onto_the_body():
     body = post()["vertices"]
     with pytest.raises(InputError, match=r"2\.41 m apart.*move it into the body's coordinates"):
-        check_worn(Path("g.npz"), garment(grid(origin=(2.5, 0.3, 0.0))[0] + [0.09, 0, 0]), body, told=False)
+        check_on_body(Path("g.npz"), garment(grid(origin=(2.5, 0.3, 0.0))[0] + [0.09, 0, 0]), body, axis_given=False)
     with pytest.raises(InputError, match=r"about the size of the body .*2\.5e\+04 m.*garment\.scale"):
-        check_worn(Path("g.npz"), garment(grid()[0] * 1e5), body, told=False)
+        check_on_body(Path("g.npz"), garment(grid()[0] * 1e5), body, axis_given=False)
 
 
 def test_check_says_what_a_garment_is_made_of(tmp_path, capsys):

@@ -16,7 +16,7 @@ from ncs_jax.geometry.skinning import to_rest_axes
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.prepare.joint_names import anatomy, pair
-from ncs_jax.prepare.motion_import import lead, load_motion, retarget_to_body
+from ncs_jax.prepare.motion_import import lead_in_frames, load_motion, retarget_to_body
 from ncs_jax.prepare.retarget import body_names, retarget, with_skeleton
 from ncs_jax.scene.spec import MotionSpec, load_scene, packaged, scene_from
 from ncs_jax.view.character import body_vertices
@@ -334,7 +334,7 @@ def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
     with pytest.raises(InputError, match=r"motion.joints.mixamorig:Head.*nose.*it has"):
         retarget(motion, body, joints={"mixamorig:Head": "nose"})
     other = retarget(motion, body, joints={"nose": "mixamorig:Head"})  # of another motion of the scene, or a slip
-    assert other.pairs == {n: n for n in body.joint_names} and any("has not: nose" in n for n in other.motion.notes)
+    assert other.pairs == {n: n for n in body.joint_names} and any("does not have: nose" in n for n in other.motion.notes)
     own = retarget_to_body(motion, body_of("mixamo"), MotionSpec(joints={"nose": "mixamorig:Head"}))
     assert np.array_equal(own.poses, motion.poses)
 
@@ -355,17 +355,17 @@ def test_what_cannot_be_retargeted_says_why(rng):
 def test_what_leads_into_a_motion_is_left_out(rng):
     motion = motion_of("cmu", rng, frames=100, amount=0)
     motion.poses[:, :, 0] = np.sin(np.arange(100) / 10)[:, None]
-    assert lead(motion) == 0
+    assert lead_in_frames(motion) == 0
     for leap in (1, 4):
         poses = motion.poses.copy()
         poses[:leap, 5, 2] = np.linspace(1.5, 0.4, leap)
         led = replace(motion, poses=poses)
-        assert lead(led) == leap and lead(replace(led, poses=poses[:15])) == 0
+        assert lead_in_frames(led) == leap and lead_in_frames(replace(led, poses=poses[:15])) == 0
         body = body_of("smpl")
         fitted = retarget_to_body(led, body, MotionSpec())
         assert len(fitted.poses) == 100 - leap and "left out" in fitted.notes[0]
         assert len(retarget_to_body(led, body, MotionSpec(frames=(0,))).poses) == 100
-    assert all(lead(io.read_motion(packaged(n))) == 0 for n in ("walk", "jump", "dance", "mixed", "twist"))
+    assert all(lead_in_frames(io.read_motion(packaged(n))) == 0 for n in ("walk", "jump", "dance", "mixed", "twist"))
 
 
 def bvh(motion: MotionRecord, tips: float = 0.1) -> str:

@@ -37,9 +37,6 @@ DRAWS = {"view"}
 
 LONG_MODULES: dict[str, str] = {}  # over 450 lines, and why
 LONG_FUNCTIONS: dict[str, str] = {
-    "io.character.rig.rig_from": "to be divided",
-    "prepare.build._model": "to be divided",
-    "prepare.retarget.retarget": "to be divided",
     "runs.train.train": "to be divided",
     "simulation.solver.cholesky._symbolic": "to be divided",
     "training.loss.gradients": "to be divided",
@@ -47,7 +44,6 @@ LONG_FUNCTIONS: dict[str, str] = {
 MANY_PARAMETERS: dict[str, str] = {
     "energies.contact.nearest._search": "to be divided",
     "metrics.quality._frame": "to be divided",
-    "prepare.build._model": "to be divided",
     "training.loss.gradients": "to be divided",
     "training.step.step": "to be divided",
 }  # over 7, and why

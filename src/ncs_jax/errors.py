@@ -8,10 +8,10 @@ __all__ = ["InputError"]
 
 
 class InputError(ValueError):
-    """A file, field or argument that the user gave is not usable.
+    """A file, field or argument of the user's that cannot be used.
 
-    The message is one line and names the file, the field, the value found, what was expected and how to mend it; the
-    commands print it and exit with code 2.
+    The message is one line: the file, the field, what was expected, the value found and the mend. The commands print it and
+    exit with code 2.
     """
 
     def __init__(
@@ -24,7 +24,7 @@ class InputError(ValueError):
         mend: str | None = None,
     ) -> None:
         self.file, self.field, self.value, self.expected, self.mend = file, field, value, expected, mend
-        where = ": ".join(str(part) for part in (file, field) if part is not None)
+        where = ": ".join(str(part) for part in (file, field) if part not in (None, ""))
         found = "" if value is None else f" (found {_short(value)})"
         text = f"{where}: {expected}{found}" if where else f"{expected}{found}"
         super().__init__(f"{text}; {mend}" if mend else text)

@@ -1,4 +1,4 @@
-"""`ncs check`: what is in a scene, and what is at risk."""
+"""`ncs check`: print what is in a scene, and what is at risk."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def add_commands(commands) -> None:
 
 
 def check(options) -> int:
-    """`ncs check`: what is in a scene, and what is at risk."""
+    """Print what is in a scene, and what is at risk."""
     from ncs_jax.io.mesh.surface import summarise_surface
-    from ncs_jax.prepare.scene_checks import findings
+    from ncs_jax.prepare.scene_checks import find_risks
     from ncs_jax.runs.run import assemble
     from ncs_jax.scene.spec import template
 
@@ -60,9 +60,9 @@ def check(options) -> int:
                 print(textwrap.fill(note, 128, initial_indent=12 * " ", subsequent_indent=14 * " "))
     if not model.moves:
         print("  the character never moves: only the static network is trained")
-    found = findings(assembly)
-    for finding in found:
-        print(f"  at risk   {finding.what}: {finding.value}: {finding.risk}; {finding.mend}")
-    if not found:
+    risks = find_risks(assembly)
+    for risk in risks:
+        print(f"  at risk   {risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
+    if not risks:
         print("  safe      material, mesh, fit and motions are inside the ranges of the stability map")
     return 0

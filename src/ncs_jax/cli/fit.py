@@ -1,4 +1,4 @@
-"""`ncs fit`: a garment brought onto a body, with a picture."""
+"""`ncs fit`: bring a garment onto a body, and draw it there."""
 
 from __future__ import annotations
 
@@ -23,22 +23,20 @@ def add_commands(commands) -> None:
     parser.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .usd*")
     parser.add_argument("--body", default="ncs:body", metavar="FILE", help="body file (default: ncs:body, the packaged one)")
     parser.add_argument("--out", required=True, metavar="FILE", help=".npz; the picture goes beside it, as .png")
-    parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found out)")
-    parser.add_argument(
-        "--up", choices=("x", "y", "z"), default="", help="the axis that is up in the file (default: found out)"
-    )
-    parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="make vertices within M metres one")
+    parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found)")
+    parser.add_argument("--up", choices=("x", "y", "z"), default="", help="the axis that is up in the file (default: found)")
+    parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="merge vertices within M metres")
     parser.add_argument(
         "--clearance",
         type=arguments.positive,
         default=0.004,
         metavar="M",
-        help="keep vertices M metres off the body (default: 0.004)",
+        help="distance to keep from the body, metres (default: 0.004)",
     )
 
 
 def fit(options) -> int:
-    """`ncs fit`: a garment on a body, written with a picture, and what was done to it."""
+    """Fit a garment to a body, write it with a picture, and print what was done to it."""
     from ncs_jax.io.mesh.surface import boundary_loops, summarise_surface
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.fit import fit as fitted
@@ -47,19 +45,21 @@ def fit(options) -> int:
 
     out, scene = Path(options.out), Scene()
     if out.suffix.lower() != ".npz":
-        raise InputError("a name that ends in .npz expected", field="--out", value=options.out, mend="it also holds weights")
+        raise InputError(
+            "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
+        )
     body = io.read_body(scene.path(options.body))
     given = io.read_garment(scene.path(options.garment), scale=options.scale, up=options.up, weld=options.weld)
     asked = {name: value for name, value in (("scale", options.scale), ("up", options.up)) if value}
     found = fitted(options.garment, given, body, clearance=options.clearance, **asked)
     g, (before, after) = found.garment, found.depth
     x, parts = g.vertices, summarise_surface(g.vertices, g.faces)
-    way = ", ".join(f"{v:.3f}" for v in found.moved)
+    shift = ", ".join(f"{v:.3f}" for v in found.moved)
     pushed = 1000 * np.linalg.norm(x - found.before, axis=1)
     print(f"{options.garment} on {options.body}: {len(x)} vertices, {len(g.faces)} triangles")
     print(
         f"  placed    {g.scale:g} m a unit, {g.up.upper()} up; "
-        + (f"moved by ({way}) m" if found.moved.any() else "where it is")
+        + (f"moved by ({shift}) m" if found.moved.any() else "not moved")
     )
     print(f"  body      {(before > 0).sum()} vertices were inside, up to {1000 * max(before.max(), 0):.1f} mm; ", end="")
     print(f"{(pushed > 0.01).sum()} moved, by {pushed.max():.1f} mm at most; {(after > 0).sum()} inside now")
@@ -69,13 +69,13 @@ def fit(options) -> int:
         long = np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()
         print(f"  hole      {len(loop)} edges, {100 * long:.0f} cm around, at a height of {x[loop, 1].mean():.2f} m")
     if PINS in given.groups:
-        print(f"  pins      {len(g.groups[PINS])} vertices, its own")
+        print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:
         print(f"  pins      {len(g.groups[PINS])} vertices around its highest hole: nothing else carries it")
     else:
-        print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on what faces up")
-    spread = f"of the body where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread from there"
-    print("  weights   " + ("its own" if given.weights is not None else spread))
+        print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
+    spread = f"the body's where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread smoothly from there"
+    print("  weights   " + ("the file's own" if given.weights is not None else spread))
     io.write_garment(out, g)
     picture, sides = out.with_suffix(".png"), np.repeat(body.vertices[None], 2, axis=0)
     labels = ("placed", "out of the body")

@@ -1,3 +1,3 @@
-"""Geometry without physics: safe norms, rotations, meshes, skinning, smooth modes."""
+"""Geometry without physics: safe norms, vectors, rotations, meshes, skinning, smooth modes."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""The smooth modes of a garment: the large, soft movements that a decoder should find easy."""
+"""Smooth modes of a garment: the large, soft movements that a decoder should find easy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["laplacian", "modal_basis"]
 
 
 def laplacian(vertices: np.ndarray, faces: np.ndarray):
-    """The Dirichlet form of a mesh (cotangent Laplacian), a sparse (verts, verts) matrix: x^T L x = sum_f A |grad x|^2."""
+    """Return the cotangent Laplacian of a mesh, a sparse (verts, verts) matrix: x^T L x = sum_f A |grad x|^2."""
     from scipy.sparse import coo_matrix
 
     rows, columns, values = [], [], []
@@ -35,17 +35,17 @@ def modal_basis(
     amplitude: float = 0.02,
     held: np.ndarray | Sequence[int] = (),
 ) -> Float[np.ndarray, "verts modes"]:
-    """The `count` smoothest modes of a garment, each with the displacement that costs about the same membrane energy.
+    """Return the `count` smoothest modes of a garment, scaled so that all cost about the same membrane energy.
 
         b_i = amplitude u_i / sqrt(1 + lambda_i / lambda_ref),  L u_i = lambda_i M u_i,  mean square of u_i = 1 over the area
 
     Args:
         vertices: (verts, 3) rest positions in m. faces: (faces, 3). area: (verts,) lumped areas in m^2.
         amplitude: displacement of the smoothest modes per unit of coefficient, m. lambda_ref is (2 pi / garment size)^2.
-        held: numbers of vertices that do not move, as pins: the modes are zero there, for moving them costs more than all else.
+        held: numbers of vertices that do not move, such as pins: the modes are zero there.
 
-    An optimiser that treats all coefficients alike (Adam) then treats drape and swing, which are soft and global, as well as
-    strain, which is stiff and local; its noise is spread over the modes at equal energy.
+    Adam takes steps of one size in all coefficients. With this scale its noise has the same energy in every mode: in drape and
+    swing, which are soft and global, as in strain, which is stiff and local.
     """
     from scipy.sparse import diags
     from scipy.sparse.linalg import eigsh

@@ -1,4 +1,4 @@
-"""What a triangle mesh fixes once: edges, hinges, areas, rest frames and lumped masses."""
+"""Triangle meshes at rest: edges, hinges, areas, rest frames and lumped areas, computed once."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, plus
 
 __all__ = ["LINE", "Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
 
-LINE = 2e-6  # a face's rest height, of its longest edge, up to which it is a line: its own positions in float32 tell no more
+LINE = 2e-6  # rest height of a face, of its longest edge, up to which it is a line: float32 positions resolve no more
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Rings:
-    """What is around what in a whole mesh, so that elements read and forces add up without a scatter.
+    """Which elements meet at each vertex, face and hinge of a whole mesh, so that forces are gathered without a scatter.
 
-    `faces` and `edges` tell where a vertex stands in them: `corner * elements + element`, padded with `corners * elements`.
-    `folds` are the hinges opposite the three corners of every face, padded with the number of hinges, and `turned` is -1 where
-    such a hinge sees the face from behind. `sides` are the two faces of a hinge, `behind` is -1 where it sees the second so.
+    `faces` and `edges` list where a vertex occurs in them: `corner * elements + element`, padded with `corners * elements`.
+    `folds` are the hinges opposite the three corners of every face, padded with the number of hinges; `turned` is -1 where the
+    face is oriented opposite to what the hinge assumes. `sides` are the two faces of a hinge; `behind` is -1 where the second
+    is oriented so.
     """
 
     faces: Int[Array, "verts most_faces"]
@@ -41,9 +42,9 @@ class Rings:
 class Mesh:
     """A garment's rest state. Lengths in m, areas in m^2, angles in rad; elements of zero rest area weigh nothing.
 
-    A face up to `LINE` times as high as its longest edge is long is of zero rest area.
+    A face has zero rest area if its height is at most `LINE` times its longest edge.
 
-    A hinge is an edge between two faces: its vertices are the two ends, then the one opposite in each face.
+    A hinge is an edge between two faces: its vertices are the two ends, then the opposite vertex of each face.
     """
 
     rest: Float[Array, "verts 3"]
@@ -62,12 +63,12 @@ class Mesh:
 
 
 def corners(x: Float[Array, "verts 3 *poses"], elements: Int[Array, "elements corners"]) -> list[Vector]:
-    """The places of the first corner of every element, of the second and so on: arrays (elements, *poses)."""
+    """Return the positions of every element's first corner, second corner and so on, by component (elements, *poses)."""
     return [[p[:, i] for i in range(3)] for p in (x[elements[:, k]] for k in range(elements.shape[1]))]
 
 
 def spread(constant: Float[Array, "elements"], like: Float[Array, "elements *poses"]) -> Float[Array, "elements ..."]:
-    """An element's constant, to go with all the lanes."""
+    """Return an element's constant with trailing axes of size 1, so that it broadcasts over all poses."""
     return constant.reshape(constant.shape + (1,) * (like.ndim - constant.ndim))
 
 
@@ -79,15 +80,15 @@ def _normals(hinge: Sequence[Vector], areas: Sequence[Array]):
 
 @jax.custom_jvp
 def dihedral(hinge: Sequence[Vector], areas: Sequence[Array]) -> Array:
-    """Signed angle phi in (-pi, pi] between the two faces of a hinge; 0 where flat, opposite for mirrored folds.
+    """Return the signed angle phi in (-pi, pi] between the two faces of a hinge: 0 where flat, opposite for mirrored folds.
 
         phi = atan2((n0 x n1) . e / |e|, n0 . n1),   dphi/dx_c = -|e| / (2 A0) n0 / |n0|^2,   likewise d,
         dphi/dx_a = -(1 - t_c) dphi/dx_c - (1 - t_d) dphi/dx_d,   dphi/dx_b = -t_c dphi/dx_c - t_d dphi/dx_d,
-        t_c, t_d where the heights of the two faces stand on the edge, 0 at a and 1 at b
+        t_c, t_d: where the heights of the two faces meet the edge, 0 at a and 1 at b
 
-    `hinge` holds the two ends a, b of the edge and the vertex opposite in each face, c, d, see `corners`; the normals n0, n1
-    are taken per rest area `areas` (m^2) so that products of them stay near 1 in float32, also in second derivatives. Exactly
-    folded or collapsed hinges have finite derivatives; a face of zero area gives angle 0.
+    `hinge` holds the two ends a, b of the edge and the opposite vertex of each face, c, d, see `corners`. The normals n0, n1
+    are divided by the rest areas `areas` (m^2), so that their products stay near 1 in float32, also in second derivatives.
+    Exactly folded or collapsed hinges have finite derivatives. A face of zero area gives angle 0.
     """
     n0, n1, edge = _normals(hinge, areas)
     long = length(edge)
@@ -118,7 +119,7 @@ def _dihedral_jvp(primals, tangents):
 
 
 def topology(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges (edges, 2), the faces on each side (edges, 2; -1 where there is none) and hinges (hinges, 4) of a manifold mesh."""
+    """Return edges (edges, 2), the faces on their sides (edges, 2; -1: none) and hinges (hinges, 4) of a manifold mesh."""
     faces = np.asarray(faces)
     half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
@@ -143,10 +144,11 @@ def topology(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def material_axes(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None, warp: tuple[float, float, float] = (0, 1, 0)
 ) -> np.ndarray:
-    """Unit warp direction u of every face (faces, 3), in its plane.
+    """Return the unit warp direction u of every face (faces, 3), in its plane.
 
-    From the UV map where there is one (the direction of growing v, the usual grain line), else the projection of `warp`;
-    where a face is nearly square to `warp`, that of the next axis is blended in, so neighbouring faces stay aligned.
+    It comes from the UV map where there is one: the direction of growing v, the usual grain line. Else it is the projection of
+    `warp`; where a face is nearly perpendicular to `warp`, the projection of the next axis is blended in, so that neighbouring
+    faces stay aligned.
     """
     p = np.asarray(vertices, np.float64)[faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -180,7 +182,7 @@ def mesh_from(
     warp: tuple[float, float, float] = (0, 1, 0),
     dtype=jnp.float32,
 ) -> Mesh:
-    """Precompute a garment mesh in float64 and store it in `dtype`.
+    """Compute the rest state of a garment in float64 and store it in `dtype`.
 
     Args:
         vertices: (verts, 3) rest positions in m. faces: (faces, 3) vertex indices of a manifold mesh.
@@ -256,7 +258,7 @@ def _rings(faces, edges, hinges, sides, verts: int, dtype) -> Rings:
 
 
 def _places(elements: np.ndarray, verts: int) -> np.ndarray:
-    """Where each vertex stands in the elements, as `Rings` has it."""
+    """Return where each vertex occurs in the elements, as in `Rings`."""
     owner = elements.T.reshape(-1)
     order = np.argsort(owner, kind="stable")
     counts = np.bincount(owner, minlength=verts)
@@ -267,6 +269,6 @@ def _places(elements: np.ndarray, verts: int) -> np.ndarray:
 
 
 def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
-    """Faces around each vertex (verts, most), padded with len(faces): gathering over it replaces a scatter."""
+    """Return the faces around each vertex (verts, most), padded with len(faces): a gather over them replaces a scatter."""
     places = _places(np.asarray(faces), verts)
     return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)

@@ -17,7 +17,7 @@ SWEEPS = 30  # of Jacobi rotations, at most
 
 
 def least_length(dtype) -> float:
-    """Length in the unit of the argument; under it a second derivative 1/length^2 nears the end of the range of the type."""
+    """Return the least length, in the unit of the argument, for which a second derivative 1/length^2 stays in range."""
     return 1e-12 if dtype == jnp.float32 else 1e-100
 
 
@@ -36,7 +36,7 @@ _ARCTANGENT = (
 
 
 def arctan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Angle of (x, y) in (-pi, pi], 0 at the origin; in float32 a polynomial, five times faster than `jnp.arctan2` on a CPU."""
+    """Return the angle of (x, y) in (-pi, pi], 0 at the origin; in float32 by a polynomial, five times faster on a CPU."""
     if y.dtype != jnp.float32:
         return jnp.arctan2(y, x)
     most, least = jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.minimum(jnp.abs(x), jnp.abs(y))
@@ -51,14 +51,14 @@ def arctan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array
 
 
 def norm(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
-    """Euclidean length of the last axis; zero with zero derivatives where the row vanishes."""
+    """Return the Euclidean length of the last axis; zero with zero derivatives where the row vanishes."""
     square = jnp.sum(x * x, axis=-1)
     singular = square < least_length(x.dtype) ** 2
     return jnp.where(singular, 0, jnp.sqrt(jnp.where(singular, 1, square)))
 
 
 def normalize(x: Float[Array, "*rows n"]) -> Float[Array, "*rows n"]:
-    """Unit vector along the last axis; zero with zero derivatives where the row vanishes."""
+    """Return the unit vector along the last axis; zero with zero derivatives where the row vanishes."""
     # A direction does not depend on scale, so the scale is a constant to the derivative, and no power of it leaves the range.
     size = lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
     singular = size < least_length(x.dtype)
@@ -67,7 +67,7 @@ def normalize(x: Float[Array, "*rows n"]) -> Float[Array, "*rows n"]:
 
 
 def signed_angle(sine: Float[Array, "*rows"], cosine: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
-    """atan2(sine, cosine) for any common scale of the two; zero with zero derivatives where both vanish."""
+    """Return atan2(sine, cosine) for any common scale of the two; zero with zero derivatives where both vanish."""
     size = lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
     singular = size < least_length(size.dtype)
     size = jnp.where(singular, 1, size)
@@ -75,15 +75,15 @@ def signed_angle(sine: Float[Array, "*rows"], cosine: Float[Array, "*rows"]) -> 
 
 
 def angle_between(a: Float[Array, "*rows 3"], b: Float[Array, "*rows 3"]) -> Float[Array, "*rows"]:
-    """Angle in [0, pi] between two vectors by atan2(|a x b|, a . b), accurate at 0 and at pi; zero where one vanishes."""
+    """Return the angle in [0, pi] between two vectors, atan2(|a x b|, a . b), accurate at 0 and pi; zero where one vanishes."""
     a, b = normalize(a), normalize(b)
     return signed_angle(norm(jnp.cross(a, b)), jnp.sum(a * b, axis=-1))
 
 
 def positive_part(a: Float[Array, "n n *lanes"]) -> Float[Array, "n n *lanes"]:
-    """Nearest positive semi-definite matrices to small symmetric ones: V max(Lambda, 0) V^T, by cyclic Jacobi rotations.
+    """Return the positive semi-definite matrices nearest to small symmetric ones: V max(Lambda, 0) V^T.
 
-    The matrices lie across the lanes, so that thousands are turned at once, until all are diagonal to rounding. Source: Golub
+    Cyclic Jacobi rotations turn thousands of matrices at once, one a lane, until all are diagonal to rounding. Source: Golub
     and Van Loan, 8.5.
     """
     n = a.shape[0]

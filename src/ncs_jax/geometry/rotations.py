@@ -24,7 +24,7 @@ __all__ = [
 
 
 def axis_angle_to_quaternion(a: Float[Array, "*rows 3"]) -> Float[Array, "*rows 4"]:
-    """q = (cos(|a|/2), sin(|a|/2) a/|a|), smooth through a = 0 (radians)."""
+    """Return q = (cos(|a|/2), sin(|a|/2) a/|a|), smooth through a = 0 (radians)."""
     square = jnp.sum(a * a, axis=-1, keepdims=True)
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1, square))
@@ -35,7 +35,7 @@ def axis_angle_to_quaternion(a: Float[Array, "*rows 3"]) -> Float[Array, "*rows 
 
 
 def quaternion_to_axis_angle(q: Float[Array, "*rows 4"]) -> Float[Array, "*rows 3"]:
-    """Axis times angle, the angle in [0, pi] whatever the sign of q."""
+    """Return axis times angle, the angle in [0, pi] whatever the sign of q."""
     q = jnp.where(q[..., :1] < 0, -q, q)
     sine = norm(q[..., 1:])[..., None]
     small = sine < 1e-6
@@ -44,7 +44,7 @@ def quaternion_to_axis_angle(q: Float[Array, "*rows 4"]) -> Float[Array, "*rows 
 
 
 def quaternion_to_matrix(q: Float[Array, "*rows 4"]) -> Float[Array, "*rows 3 3"]:
-    """Rotation matrix of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion."""
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -55,12 +55,12 @@ def quaternion_to_matrix(q: Float[Array, "*rows 4"]) -> Float[Array, "*rows 3 3"
 
 
 def axis_angle_to_matrix(a: Float[Array, "*rows 3"]) -> Float[Array, "*rows 3 3"]:
-    """Rotation matrix exp([a]x) (radians)."""
+    """Return the rotation matrix exp([a]x) (radians)."""
     return quaternion_to_matrix(axis_angle_to_quaternion(a))
 
 
 def matrix_to_quaternion(r: Float[Array, "*rows 3 3"]) -> Float[Array, "*rows 4"]:
-    """Unit quaternion of a rotation matrix, w >= 0, from the largest of its four squares (Shepperd 1978)."""
+    """Return the unit quaternion of a rotation matrix, w >= 0, by its largest component (Shepperd 1978)."""
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     a, b, c = r[..., 2, 1], r[..., 0, 2], r[..., 1, 0]
     d, e, f = r[..., 1, 2], r[..., 2, 0], r[..., 0, 1]
@@ -80,13 +80,15 @@ def matrix_to_quaternion(r: Float[Array, "*rows 3 3"]) -> Float[Array, "*rows 4"
 
 
 def matrix_to_six(r: Float[Array, "*rows 3 3"]) -> Float[Array, "*rows 6"]:
-    """The first two columns, a continuous description of a rotation (Zhou et al. 2019)."""
+    """Return the first two columns, a continuous description of a rotation (Zhou et al. 2019)."""
     return jnp.concatenate([r[..., :, 0], r[..., :, 1]], axis=-1)
 
 
 def slerp(p: Float[Array, "*rows 4"], q: Float[Array, "*rows 4"], t: Float[Array, "*rows"] | float) -> Float[Array, "*rows 4"]:
-    """Interpolate two unit quaternions along the **shorter** arc: q and -q are one rotation, so q is first taken from p's
-    hemisphere."""
+    """Interpolate two unit quaternions along the **shorter** arc.
+
+    q and -q are the same rotation: the one nearer to p is used.
+    """
     dot = jnp.sum(p * q, axis=-1, keepdims=True)
     q = jnp.where(dot < 0, -q, q)
     t = jnp.broadcast_to(jnp.asarray(t, p.dtype), dot.shape[:-1])[..., None]
@@ -106,7 +108,7 @@ def resample(
     source_fps: float,
     fps: float,
 ) -> tuple[Float[Array, "new joints 3"], Float[Array, "new 3"]]:
-    """A motion at another frame rate: rotations by slerp, translations linearly; whole ratios keep their frames exactly."""
+    """Resample a motion to another frame rate: rotations by slerp, translations linearly; whole ratios keep frames exactly."""
     frames = poses.shape[0]
     count = int((frames - 1) * fps / source_fps + 1e-6) + 1
     # Times, in source frames, are known on the host: in float32 they would lose whole ratios after some hundred frames.

@@ -35,7 +35,7 @@ class Skeleton:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pose:
-    """What a frame of motion does to the joints: world rotations since rest, and world positions in m."""
+    """The joints in a frame of motion: world rotations since rest, and world positions in m."""
 
     rotations: Float[Array, "*frames joints 3 3"]
     positions: Float[Array, "*frames joints 3"]
@@ -47,7 +47,7 @@ class Blend:
     """Skinning weights, sparse by column: only the joints that move some vertex are kept; rows sum to 1.
 
     The blend is then one small matrix product. On a CPU that is ten times faster over a batch than gathering each vertex's own
-    few joints, whose 12 numbers apiece do not stay in registers.
+    few joints, because their 12 numbers each do not stay in registers.
     """
 
     weights: Float[Array, "verts used"]
@@ -57,15 +57,15 @@ class Blend:
 def to_rest_axes(
     rotations: Float[Array, "*frames joints 3 3"], rest_rotations: Float[Array, "joints 3 3"]
 ) -> Float[Array, "*frames joints 3 3"]:
-    """Local rotations given in each joint's own rest frame Q_j (Mixamo, glTF), as ones along the world's axes: Q_j R_j Q_j^T.
+    """Return local rotations along the world's axes, Q_j R_j Q_j^T, of those in each joint's own rest frame Q_j (Mixamo, glTF).
 
-    A skeleton without rest rotations (SMPL) needs no such turn; after it, every skeleton is of that kind.
+    A skeleton without rest rotations (SMPL) does not need it.
     """
     return jnp.einsum("jab,...jbc,jdc->...jad", rest_rotations, rotations, rest_rotations, precision="highest")
 
 
 def forward(skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], translation: Float[Array, "*frames 3"]) -> Pose:
-    """Forward kinematics: R_j = R_parent R_local, p_j = p_parent + R_parent (J_j - J_parent).
+    """Compute forward kinematics: R_j = R_parent R_local, p_j = p_parent + R_parent (J_j - J_parent).
 
     Args:
         skeleton: rest joints and parents. rotations: local rotations since rest. translation: (..., 3) of the root, m.
@@ -85,16 +85,16 @@ def forward(skeleton: Skeleton, rotations: Float[Array, "*frames joints 3 3"], t
     for level in range(1, int(depth.max(initial=0)) + 1):
         here = order[depth[order] == level]
         above = place[parents[here]]
-        turned = world[..., above, :, :]
+        turns = world[..., above, :, :]
         bone = skeleton.joints[here] - skeleton.joints[parents[here]]
-        offset = jnp.einsum("...jab,jb->...ja", turned, bone, precision="highest")
+        offset = jnp.einsum("...jab,jb->...ja", turns, bone, precision="highest")
         position = jnp.concatenate([position, position[..., above, :] + offset], axis=-2)
-        world = jnp.concatenate([world, jnp.matmul(turned, rotations[..., here, :, :], precision="highest")], axis=-3)
+        world = jnp.concatenate([world, jnp.matmul(turns, rotations[..., here, :, :], precision="highest")], axis=-3)
     return Pose(world[..., place, :, :], position[..., place, :])
 
 
 def transforms(skeleton: Skeleton, pose: Pose) -> Float[Array, "*frames joints 3 4"]:
-    """Rigid motion [R_j | p_j - R_j J_j] of every joint from rest to pose."""
+    """Return the rigid motion [R_j | p_j - R_j J_j] of every joint from rest to pose."""
     shift = pose.positions - jnp.einsum("...jab,jb->...ja", pose.rotations, skeleton.joints, precision="highest")
     return jnp.concatenate([pose.rotations, shift[..., None]], axis=-1)
 
@@ -112,19 +112,19 @@ def blend_from(dense: np.ndarray, most: int = 8, dtype=jnp.float32) -> Blend:
 
 
 def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[Array, "verts 3 4 *poses"]:
-    """Blended transform of every vertex, sum_j w_vj [R_j | t_j], in any number of poses."""
+    """Return the blended transform of every vertex, sum_j w_vj [R_j | t_j], in any number of poses."""
     used = matrices[np.asarray(weights.joints)]
     blended = jnp.matmul(weights.weights, used.reshape(used.shape[0], -1), precision="highest")
     return blended.reshape(-1, *matrices.shape[1:])
 
 
 def skin(blended: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *#poses"]) -> Float[Array, "verts 3 *poses"]:
-    """Linear blend skinning: unposed positions to posed ones, m."""
+    """Pose positions by linear blend skinning, from unposed ones, m."""
     return sum((blended[:, :, i] * x[:, i, None] for i in range(3)), start=blended[:, :, 3])
 
 
 def unpose(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
-    """Inverse of `skin`, by the adjugate. Singular only where opposite rotations cancel in the blend; zeros there."""
+    """Return the inverse of `skin`, by the adjugate; zeros where it is singular: opposite rotations cancel in the blend."""
     a, b, c = blended[..., 0], blended[..., 1], blended[..., 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
     determinant = jnp.sum(a * jnp.cross(b, c), axis=-1)

@@ -1,4 +1,4 @@
-"""Files in and out: readers return checked NumPy records, and whatever is wrong with a file becomes one InputError."""
+"""Files in and out: readers return checked NumPy records; whatever is wrong with a file becomes one InputError."""
 
 from ncs_jax.io.animation.animation import read_animation, write_animation
 from ncs_jax.io.character.body import read_body

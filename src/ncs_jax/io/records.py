@@ -1,4 +1,4 @@
-"""What the readers return: plain NumPy arrays, already checked, in metres and seconds unless a field says otherwise."""
+"""Records that the readers return: plain NumPy arrays, already checked, in metres and seconds unless a field says otherwise."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class GarmentRecord:
 
     Attributes:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
-            or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: metres a unit of the file and the
-            axis that is up in it, which were applied. welded: how many of the file's vertices became one with another.
-            weights: (V, J) skinning weights of the body's joints, not negative, every row of which sums to 1; None: the body's.
+            or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: the file's unit in metres and its
+            axis that is up; both are already applied. welded: how many of the file's vertices were merged into another.
+            weights: (V, J) skinning weights for the body's joints, not negative, every row sums to 1; None: the body's.
     """
 
     vertices: np.ndarray
@@ -52,15 +52,15 @@ class GarmentRecord:
 
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
-    """What the skeleton does.
+    """The motion of a skeleton.
 
     Attributes:
         poses: (T, J, 3) local rotations since rest, axis times angle, rad. translation: (T, 3) of the root since rest, m.
-        fps: frames per second. joint_names: J names, or none. joints: (J, 3) global rest positions in the unit of the
-            translation, parents: (J,) int32 as of a body, and tips: (J, 3) global rest positions of the ends of the last bones,
-            NaN elsewhere, where the file has its own skeleton. rest_rotations: (J, 3, 3) the axes that poses are along, as of a
-            body; None: the world's. up: the axis of the world that points up, where the format says, else "". notes: what was
-            done so that it drives the body.
+        fps: frames per second. joint_names: J names, or none.
+        joints, parents, tips: the file's own skeleton, or None: (J, 3) global rest positions in the unit of the translation,
+            (J,) int32 as in a body, and (J, 3) global rest positions of the ends of the last bones, NaN at other joints.
+        rest_rotations: (J, 3, 3) as in a body: the axes that the poses are along; None: the world's. up: the axis of the world
+            that points up, where the format says so, else "". notes: what was done so that the motion drives the body.
     """
 
     poses: np.ndarray

@@ -1,4 +1,4 @@
-"""`ncs fit`: a garment brought onto a body, out of it, with pins to hang on and weights that follow the body."""
+"""A garment fitted to a body: placed on it, pushed out of it, pinned where nothing carries it, weighted to follow it."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
-from ncs_jax.prepare.garment_checks import FAR, UNITS, stray
+from ncs_jax.prepare.garment_checks import FAR, UNITS, distance_outside
 from ncs_jax.prepare.skinning_weights import transfer_weights
 
 __all__ = ["PINS", "Fitted", "fit", "pins_of", "place", "push_out", "spread_weights"]
 
-PINS = "pins"
-TURNS_OUT, RINGS = 200, 6
-STAYS = 1.5  # times as ill as anywhere else a garment may fit and is not moved
-NEAR = 0.05  # m from the body within which it carries cloth
-LYING, SMOOTH, LEAST = 0.02, 0.03, 1e-6  # m, m, and what cloth that lies nowhere is trusted
-ALIKE = 0.5  # cosine between the normals of cloth and body that face each other
-UPWARD = 0.6  # cosine between the body's normal and up, where it carries cloth
-CARRIED = 0.01  # m^2 that shoulders or straps offer at the least
-BAND = 0.02  # m that a waistband is high
+PINS = "pins"  # the vertex group that is written
+PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
+KEEPS_PLACE = 1.5  # a garment is not moved unless its misfit is more than this many times that of the best place
+NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
+LYING, SMOOTH = 0.02, 0.03  # m; see `spread_weights`
+LEAST = 1e-6  # how much the weights of cloth far from the body count
+OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away from the body
+UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
+CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
+BAND = 0.02  # m; height of a waistband
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A garment on a body, and what was done so that it is.
+    """A garment on a body, and what was done to bring it there.
 
-    garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. before: its vertices (V, 3) in m
-    when it was placed but not pushed. moved: how far it was moved, m. depth: (before, after), of every vertex in the body, m,
-    negative outside. carried: m^2 of it that lie on what faces up. lying: share of the vertices that lie on the body.
+    garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. before: its vertices (V, 3), m,
+    after it was placed and before it was pushed out. moved: by how much it was moved (3,), m. depth: of every vertex inside the
+    body, before and after the push, m, negative outside. carried: its area that lies on what faces up, m^2. lying: share of its
+    vertices that lie on the body.
     """
 
     garment: GarmentRecord
@@ -61,14 +63,14 @@ def fit(
     scale: float | None = None,
     up: str | None = None,
 ) -> Fitted:
-    """Bring a garment onto a body; a group `pins` of its own, and its own weights, are kept.
+    """Bring a garment onto a body. Its own group `pins` and its own weights, if it has them, are kept.
 
     Args:
-        file: the garment's, for errors. garment: as read. clearance: m that every vertex is kept off the body.
-        scale, up: metres a unit of the file and the axis that is up in it, where they are known; else found out.
+        file: the garment's, for errors. garment: as read. clearance: least distance of every vertex from the body, m.
+        scale, up: metres a unit of the file and the axis that is up in it; None: they are found.
 
     Raises:
-        InputError: no unit, no axes and no place make it lie on the body, or it cannot be pushed out of it.
+        InputError: no unit, axis and place make it lie on the body, or it cannot be pushed out of the body.
     """
     placed, moved = place(file, garment, body, scale=scale, up=up)
     before = placed.vertices
@@ -78,7 +80,7 @@ def fit(
         raise InputError(
             f"a garment that can be pushed out of the body expected, as placed with {placed.scale:g} m a unit and "
             f"{placed.up.upper()} up", file=file, field="vertices", value=f"{farthest:.2f} m out",
-            mend="bring it onto the body by hand, or say its unit and axis with --scale and --up",
+            mend="bring it onto the body by hand, or state its unit and axis with --scale and --up",
         )  # fmt: skip
     surface = surface_from(x, body.vertices, body.faces)
     placed = replace(placed, vertices=x)
@@ -96,33 +98,34 @@ def fit(
 def place(
     file: str | Path, garment: GarmentRecord, body: BodyRecord, *, scale: float | None = None, up: str | None = None
 ) -> tuple[GarmentRecord, np.ndarray]:
-    """The garment in the unit, with the axis up and at the place where it lies on the body, and how far it was moved, m.
+    """Return the garment in the unit, with the axis and at the place in which it lies on the body; and how far it moved, m.
 
-    What lies there as it is stays as it is. Else each unit and axis is tried, first in place, then moved to where it is
-    least inside the body and nearest to it.
+    A garment that lies on the body as it is stays so. Else every unit and axis is tried, first without moving it, then moved to
+    where it is least inside the body and nearest to it.
 
     Raises:
         InputError: in no unit has it the size of something worn.
     """
     found = list(_candidates(garment, body, scale, up, 5)) or list(_candidates(garment, body, scale, up, 10))
-    there = [c for c in found if stray(c.vertices, body.vertices) <= FAR]
-    if there:
-        return there[0], np.zeros(3)
+    in_place = [c for c in found if distance_outside(c.vertices, body.vertices) <= FAR]
+    if in_place:
+        return in_place[0], np.zeros(3)
     if found:
-        _, way, best = min(((*_settled(c, body), c) for c in found), key=lambda t: t[0])
-        return replace(best, vertices=best.vertices + way.astype(best.vertices.dtype)), way
+        _, shift, best = min(((*_best_place(c, body), c) for c in found), key=lambda t: t[0])
+        return replace(best, vertices=best.vertices + shift.astype(best.vertices.dtype)), shift
     raise InputError(
         "a garment about the size of the body expected, in any unit", file=file, field="vertices",
-        value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="say its unit with --scale, and --up",
+        value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state unit and axis with --scale and --up",
     )  # fmt: skip
 
 
 def _candidates(
     garment: GarmentRecord, body: BodyRecord, scale: float | None, up: str | None, least: float
 ) -> Iterator[GarmentRecord]:
-    """In every unit and with every axis up in which it has the size of something worn, as given first.
+    """Yield the garment in every unit and with every axis up in which it has the size of something worn; as given first.
 
-    In another unit than that it has at least the body's size by `least`: a skirt in inches fits an arm in centimetres.
+    In a unit other than the given one it must have at least a `least`-th of the body's size: a skirt in inches would fit an arm
+    if it were read in centimetres.
     """
     units = (scale,) if scale else dict.fromkeys((garment.scale, *UNITS))
     axes = (up,) if up else dict.fromkeys((garment.up, "y", "z", "x"))
@@ -136,11 +139,11 @@ def _candidates(
                 yield replace(garment, vertices=x, scale=unit, up=axis)
 
 
-def _settled(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.ndarray]:
-    """How ill a garment fits the body where it fits it best, m, and how far it is moved to there, if at all.
+def _best_place(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.ndarray]:
+    """Return the misfit of a garment where it fits the body best, m, and the shift (3,) to that place, zero if it may stay.
 
-    That is how far it is from the skin, five times as much within it, over how much the two face alike: a ring around chest and
-    back may be near them, and faces elsewhere.
+    The misfit is its mean distance from the skin, inside counted five times, divided by how well their normals agree: a ring
+    may lie close to chest and back while it faces elsewhere.
     """
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
@@ -151,19 +154,19 @@ def _settled(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.ndarra
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
     trunk = np.median(body.vertices, axis=0)
 
-    def ill(way: np.ndarray) -> float:
-        away, index = tree.query(x + way)
-        side = np.sum((x + way - body.vertices[index]) * normals[index], axis=1)
-        alike = abs(np.mean(np.sum(facing * normals[index], axis=1)))  # of one that faces inward, too
-        return float(np.mean(np.where(side < 0, 5 * away, away)) / max(alike, 0.05))
+    def misfit(shift: np.ndarray) -> float:
+        away, index = tree.query(x + shift)
+        side = np.sum((x + shift - body.vertices[index]) * normals[index], axis=1)
+        agreement = abs(np.mean(np.sum(facing * normals[index], axis=1)))  # the garment's normals may also point inward
+        return float(np.mean(np.where(side < 0, 5 * away, away)) / max(agreement, 0.05))
 
     middle = (x.min(axis=0) + x.max(axis=0)) / 2
     heights = np.linspace(low[1], high[1], 25)
     starts = [np.zeros(3), *(np.array([trunk[0], y, trunk[2]]) - middle for y in heights)]
-    first = min(starts, key=ill)
-    best = minimize(ill, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 200})
-    stays = ill(np.zeros(3))
-    return (stays, np.zeros(3)) if stays <= STAYS * best.fun else (float(best.fun), np.asarray(best.x))
+    first = min(starts, key=misfit)
+    best = minimize(misfit, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 200})
+    here = misfit(np.zeros(3))
+    return (here, np.zeros(3)) if here <= KEEPS_PLACE * best.fun else (float(best.fun), np.asarray(best.x))
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
@@ -182,16 +185,16 @@ def _distance(x, body, surface: Surface):
 
 
 def _distances(x: np.ndarray, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance to the body of points (V, 3), m, and the unit vectors that lead away from it."""
+    """Return the signed distance (V,) of points (V, 3) to the body, m, and the unit vectors (V, 3) that lead away from it."""
     found = _distance(jnp.asarray(x, jnp.float32), jnp.asarray(body.vertices, jnp.float32), surface)
     return np.asarray(found[0], np.float64), np.asarray(found[1], np.float64)
 
 
 def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
-    """Vertices (V, 3) and middles of edges at least so far (m) from the body; the rest follows, so that it stays smooth.
+    """Return vertices (V, 3) moved so that they and the middles of edges keep the clearance (m) from the body.
 
-    Each turn moves a vertex that is too near, or at one end of an edge that is, along the normal to where it is not, and the
-    `RINGS` rings around it part of the way.
+    Each round moves a vertex that is too near the body, or that ends an edge whose middle is, away from the body until it is
+    not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth.
     """
     from scipy.sparse import coo_array, diags_array
 
@@ -201,8 +204,8 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
     surface = surface_from(with_middles(x, edges), body.vertices, body.faces)
     rest, held, own = x.astype(np.float64), np.zeros(len(x), bool), np.zeros(x.shape)
-    far = FAR * np.ptp(body.vertices, axis=0).max()  # beyond which it is not being pushed out of anything
-    for _ in range(TURNS_OUT):
+    far = FAR * np.ptp(body.vertices, axis=0).max()  # a garment pushed farther is not on the body
+    for _ in range(PUSHES):
         moved = own
         for _ in range(RINGS):
             moved = np.where(held[:, None], own, mean @ moved)
@@ -218,25 +221,25 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
 
 
 def with_middles(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3), then the middles of edges (E, 2)."""
+    """Return vertices (V, 3), followed by the middles of edges (E, 2)."""
     return np.concatenate([x, x[edges].mean(axis=1)])
 
 
-# --- what it hangs on, and what it follows --------------------------------------------------------------------------
+# --- pins and weights -----------------------------------------------------------------------------------------------
 
 
 def pins_of(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, float]:
-    """Vertices to pin so that a garment does not slide down, none if it lies on shoulders; and the area that lies there, m^2.
+    """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; and the area carried, m^2.
 
-    Cloth is carried where it lies on what faces up in its upper half. With less than `CARRIED` of it, the highest loop of
-    the boundary is a waistband: it and what is within `BAND` below it are pinned.
+    The body carries the upper half of the cloth where it lies on skin that faces up. If less than `CARRIED` is carried, the
+    highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it.
     """
     x, faces = garment.vertices.astype(np.float64), garment.faces
     distance, away = _distances(x, body, surface)
     double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=1)
     area = np.bincount(faces.ravel(), np.repeat(double / 6, 3), len(x))
     outward = vertex_normals(x, faces)
-    outer = np.sum(outward * away, axis=1) > ALIKE
+    outer = np.sum(outward * away, axis=1) > OUTWARD
     high = x[:, 1] > np.mean([x[:, 1].min(), x[:, 1].max()])
     carried = float(area[(distance < NEAR) & (away[:, 1] > UPWARD) & outer & high].sum())
     loops = boundary_loops(faces)
@@ -250,14 +253,14 @@ def pins_of(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple
 
 
 def spread_weights(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, float]:
-    """Skinning weights (V, J) that follow the body where cloth lies on it and are smooth; and the share of it that lies there.
+    """Return smooth skinning weights (V, J) that follow the body where cloth lies on it; and the share of vertices that do so.
 
         min_w  sum_v c_v (w_v - w_body(v))^2 + (L / l)^2 sum_(edges v-u) (w_v - w_u)^2,
         c_v = exp(-(d / L0)^2) max(n . n_body, 0)
 
-    d is the distance to the body (m), l the mean edge, L = `SMOOTH` and L0 = `LYING`. So what hangs free between the legs goes
-    along with what it hangs on and is not torn to either side. Weights are 0 to 1 and sum to 1, as a matrix of positive inverse
-    makes them. Source: the matching of Abdrashitov et al. 2023, blended in here instead of cut off.
+    d is the distance to the body (m), l the mean edge, L = `SMOOTH` and L0 = `LYING`. So cloth that hangs free between the legs
+    follows the cloth that it hangs on, and is not torn to either side. Weights are 0 to 1 and sum to 1, because the inverse of
+    the system's matrix is positive. Source: the matching of Abdrashitov et al. 2023, with a smooth c_v instead of a threshold.
     """
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import splu

@@ -1,10 +1,12 @@
-"""What a joint is by its name: CMU's, MakeHuman's, Poser's, SMPL's, Mixamo's, Blender's, Unreal's and Biped's conventions."""
+"""Joints told by their names: the conventions of CMU, MakeHuman, Poser, SMPL, Mixamo, Blender, Unreal and Biped."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from ncs_jax.io.character.hierarchy import path_to_root
 
 __all__ = ["Limbs", "anatomy", "pair"]
 
@@ -25,7 +27,7 @@ WORDS = {
     "toe": ("toe", "toes", "toebase", "ball", "toe0"),
 }
 ROLES = {word: role for role, words in WORDS.items() for word in words}
-# What these are depends on what else the side has: without it the first, with it the second.
+# The role of these words depends on what else the side has. Each: the role alone, the rival role, the role beside the rival.
 EITHER = {
     "shoulder": ("arm", "arm", "clavicle"),
     "hip": ("thigh", "thigh", "hip joint"),
@@ -41,8 +43,8 @@ SAME_FINGER = {"mid": "middle", "little": "pinky", "finger": "index"}  # MakeHum
 class Limbs:
     """The joints of a skeleton by what they are.
 
-    roles: joint of each role, as "hips", "head", "left forearm"; of what has no role, of its plain name. spine: from above the
-    hips to the joint that carries the arms. neck: from there to below the head.
+    roles: the joint of each role, such as "hips", "head", "left forearm"; a joint without a role is listed by its plain name.
+    spine: joints from above the hips to the one that carries the arms. neck: joints from there to below the head.
     """
 
     roles: dict[str, int]
@@ -53,8 +55,8 @@ class Limbs:
 def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
     """Find out what the joints are: limbs by their names; spine and neck, whatever they are called, by what hangs on them.
 
-    Case, separators and prefixes of a rig do not matter. A shoulder, hip, hand or foot is one thing or another by what else
-    its side has: SMPL's shoulder bends the upper arm, Mixamo's carries it.
+    Case, separators and a rig's prefixes do not matter. What a shoulder, hip, hand or foot means depends on what else its side
+    has: SMPL's shoulder bends the upper arm, Mixamo's carries it.
 
     Args:
         names: of the joints. parents: their parents, before them, -1 at the root.
@@ -64,10 +66,10 @@ def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
     for j, (side, word) in enumerate(plain):
         beside = {w for s, w in plain if s == side} if side else set()
         roles.setdefault(f"{side} {_role(word, beside)}".strip(), j)
-    above = [_path(j, parents) for j in range(len(names))]
+    above = [path_to_root(parents, j) for j in range(len(names))]
 
     def meet(*words: str) -> int | None:
-        """The joint farthest from the root that carries a role of both sides."""
+        """Return the joint farthest from the root that carries a role of both sides."""
         for word in words:
             if f"left {word}" in roles and f"right {word}" in roles:
                 both = [j for j in above[roles[f"left {word}"]] if j in above[roles[f"right {word}"]]]
@@ -93,9 +95,10 @@ def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
 
 
 def pair(source: Limbs, target: Limbs) -> dict[int, int]:
-    """The joint of the source that drives each joint of the target: of equal role; along spine and neck, evenly spread.
+    """Return the source's joint that drives each joint of the target: the one of equal role; spine and neck are spread evenly.
 
-    The last joint of the longer spine is the last of the shorter, as the arms hang on it; a lone one is the lowest.
+    The last joints of both spines are paired, because the arms hang on them. Where one spine is a single joint, the source's
+    last joint drives the target's lowest.
     """
     pairs = {j: source.roles[word] for word, j in target.roles.items() if word in source.roles}
     for here, there in ((source.spine, target.spine), (source.neck, target.neck)):
@@ -106,11 +109,12 @@ def pair(source: Limbs, target: Limbs) -> dict[int, int]:
 
 
 def _spread(i: int, count: int, length: int, lone: int) -> int:
+    """Return the place of pair i of `count` in a chain of `length` joints; that of a lone pair is given."""
     return lone if count == 1 else round(i * (length - 1) / (count - 1))
 
 
 def _plain(name: str) -> tuple[str, str]:
-    """Side ("left", "right" or "") and the rest of a name, in small letters and without separators."""
+    """Return the side ("left", "right" or "") and the rest of a name, in small letters and without separators."""
     parts = [p.lower() for p in PART.findall(PREFIX.sub("", re.split(r"[:|]", name)[-1]))]
     parts = [str(int(p)) if p.isdigit() else p for p in parts]
     for side in ("left", "right"):
@@ -128,7 +132,7 @@ def _plain(name: str) -> tuple[str, str]:
 
 
 def _role(word: str, beside: set[str]) -> str:
-    """The role of a plain word, given the plain words of its side; the word itself where it has none."""
+    """Return the role of a plain word, given the plain words of its side; the word itself where it has none."""
     if found := FINGER.fullmatch(word):
         finger = "thumb" if word.endswith("finger0") else SAME_FINGER.get(found[1], found[1])
         return f"{finger} {found[2] if found[2] not in ('', '0') else 1}"
@@ -136,22 +140,14 @@ def _role(word: str, beside: set[str]) -> str:
     if word not in EITHER or not beside:
         return ROLES.get(word, word)
     alone, rival, then = EITHER[word]
-    known = {ROLES.get(w.removesuffix("1")) for w in beside if w != word}
+    others = {ROLES.get(w.removesuffix("1")) for w in beside if w != word}
     if word == "leg":  # a thigh only where something else is the shin
-        return then if "shin" in known and "thigh" not in known else alone
-    return then if rival in known else alone
-
-
-def _path(j: int, parents: Sequence[int]) -> list[int]:
-    """A joint and all above it, itself first."""
-    path = [j]
-    while parents[path[-1]] >= 0:
-        path.append(int(parents[path[-1]]))
-    return path
+        return then if "shin" in others and "thigh" not in others else alone
+    return then if rival in others else alone
 
 
 def _between(low: int, high: int | None, above: list[list[int]]) -> tuple[int, ...]:
-    """Joints above `low`, up to and with `high`; none where `high` does not hang on `low`."""
+    """Return the joints above `low` up to and with `high`; none where `high` does not hang on `low`."""
     if high is None or low not in above[high]:
         return ()
     return tuple(reversed(above[high][: above[high].index(low)]))

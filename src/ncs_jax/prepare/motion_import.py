@@ -1,4 +1,4 @@
-"""A motion as read becomes one of a scene's body: frames chosen, turned upright, its joints reordered, or retargeted."""
+"""Motions for a scene's body: read, frames chosen, turned upright, joints reordered or retargeted, resampled."""
 
 from __future__ import annotations
 
@@ -13,49 +13,46 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
-from ncs_jax.prepare.retarget import body_names, retarget, turned, upright_turn, with_skeleton
+from ncs_jax.prepare.retarget import body_names, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.scene.spec import MotionSpec, Scene, packaged
 
-__all__ = ["lead", "load_motion", "mirror_partners", "retarget_to_body"]
+__all__ = ["lead_in_frames", "load_motion", "mirror_partners", "retarget_to_body"]
 
-LEAP = 3.0  # times the fastest turn of nearly all frames: what begins with more leaves a pose that is not part of the motion
+JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
 
 
 def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: MotionSpec, world: str = "y") -> MotionRecord:
-    """The same motion of the body's joints, in m, its `notes` saying what was done.
+    """Return a motion as one of the body's joints, in m; its `notes` say what was done.
 
-    A skeleton of its own that is not the body's, or other joints, are retargeted (`retarget.retarget`), and what leads in
-    (`lead`) is left out unless the scene chooses frames. SMPL's motions of 22, 24, 52 and 55 joints drive each other's bodies
-    joint by joint, as they are, and so do motions of as many joints as the body has, in the order of the names.
+    A motion with another skeleton or other joints is retargeted (`retarget.retarget`). Where the motion has its own skeleton,
+    frames that only lead in (`lead_in_frames`) are left out unless the scene chooses frames. SMPL's motions of 22, 24, 52 and
+    55 joints drive each other's bodies joint by joint. So do motions of as many joints as the body has, matched by name.
 
     Args:
-        motion: as read. body: none for a garment without one. spec: says up, scale and joints. world: the axis that points up.
+        motion: as read. body: None for a garment without one. spec: gives up, scale and joints. world: the axis that points up.
 
     Raises:
         InputError: the motion's joints are not the body's and nothing says which is which.
     """
     notes: tuple[str, ...] = ()
     joints = 1 if body is None else len(body.parents)
-    own = motion.joints is not None
-    if own and not spec.frames and (first := lead(motion)):
+    if motion.joints is not None and not spec.frames and (first := lead_in_frames(motion)):
         motion = replace(motion, poses=motion.poses[first:], translation=motion.translation[first:])
-        which = "frame 0, a pose from which it leaps, is" if first == 1 else f"frames 0 to {first - 1}, which leap into it, are"
+        which = "frame 0, a pose that jumps into it, is" if first == 1 else f"frames 0 to {first - 1}, which jump into it, are"
         notes = (f"{which} left out; motion.frames = [0] keeps all",)
     names = () if body is None else body_names(body)
-    told = set(spec.joints) & set(motion.joint_names or smpl_names(motion.poses.shape[1]))
-    if body is not None and (told or not _direct(motion, body, names)):
-        short = None if told else _smpl(motion, body)
-        if short is None:
-            up = "" if spec.up == "auto" else spec.up
-            found = retarget(
-                with_skeleton(_of_package(motion), joints), body, joints=spec.joints, scale=spec.scale, up=up, world=world
-            ).motion
+    overridden = set(spec.joints) & set(motion.joint_names or smpl_names(motion.poses.shape[1]))
+    if body is not None and (overridden or not _has_joints_of(motion, body, names)):
+        smpl = None if overridden else _between_smpl(motion, body)
+        if smpl is None:
+            up, source = "" if spec.up == "auto" else spec.up, with_skeleton(_with_packaged_skeleton(motion), joints)
+            found = retarget(source, body, joints=spec.joints, scale=spec.scale, up=up, world=world).motion
             return replace(found, notes=notes + found.notes)
-        motion, notes = short, (*notes, *short.notes)
+        motion, notes = smpl, (*notes, *smpl.notes)
     if motion.poses.shape[1] != joints:
         raise InputError(
             f"{joints} joints expected, as the body has", field="poses", value=f"{motion.poses.shape[1]} joints",
-            mend="give a motion of this skeleton",
+            mend="give a motion of the body's joints",
         )  # fmt: skip
     poses, translation, axes = motion.poses, motion.translation, motion.rest_rotations
     if names and motion.joint_names and motion.joint_names != names and set(motion.joint_names) == set(names):
@@ -63,28 +60,29 @@ def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: Motion
         poses, axes = poses[:, order], None if axes is None else axes[order]
     if axes is not None:
         change = axes if body is None or body.rest_rotations is None else np.swapaxes(body.rest_rotations, 1, 2) @ axes
-        if np.abs(change - np.eye(3)).max() > 1e-4:  # the same joints, whose own axes are others
+        if np.abs(change - np.eye(3)).max() > 1e-4:  # the same joints, but their rest axes differ
             poses = np.einsum("jab,tjb->tja", change, poses)
     if spec.scale:
         translation = translation * spec.scale
         notes = (*notes, f"a unit of its path is {spec.scale:.4g} m, as the scene says")
-    turn = upright_turn((motion.up or world) if spec.up == "auto" else spec.up, world)
-    if turned(turn):
+    turn = up_rotation((motion.up or world) if spec.up == "auto" else spec.up, world)
+    if turn_note(turn):
         axes = np.eye(3) if body is None or body.rest_rotations is None else body.rest_rotations[0]  # the root's own
         root = axes.T @ turn @ axes @ Rotation.from_rotvec(poses[:, 0]).as_matrix()
         poses = poses.copy()
         poses[:, 0] = Rotation.from_matrix(root).as_rotvec()
         home = np.zeros(3) if body is None else body.joints[0].astype(np.float64)
         translation = (home + translation) @ turn.T - home
-        notes = (*notes, *turned(turn))
+        notes = (*notes, *turn_note(turn))
     return MotionRecord(poses, translation, motion.fps, names, notes=notes)
 
 
-def lead(motion: MotionRecord) -> int:
-    """How many first frames only lead in: a pose, as the T-pose of many .bvh files, and the leap from it into the motion.
+def lead_in_frames(motion: MotionRecord) -> int:
+    """Count the first frames that only lead in: a pose, as the T-pose of many .bvh files, and the jump from it into the motion.
 
-    They end where the fastest joint turns no more from one frame to the next than it does in 19 of 20 frames; there are none
-    unless its first turn is `LEAP` times that, nor in motions of fewer than 20 frames.
+    Let the usual turn be what the fastest joint turns within a frame, at most, in 19 of 20 frames. There are such frames only
+    where the first turn is more than `JUMP` times the usual. They end with the first turn that is usual. A motion of fewer than
+    20 frames has none.
     """
     frames, joints = motion.poses.shape[:2]
     if frames < 20:
@@ -93,11 +91,11 @@ def lead(motion: MotionRecord) -> int:
     own = np.arange(frames * joints)
     angle = (turns[own[:-joints]].inv() * turns[own[joints:]]).magnitude().reshape(-1, joints).max(axis=1)
     usual = np.percentile(angle, 95)
-    return int(np.argmax(angle <= usual)) if angle[0] > LEAP * usual else 0
+    return int(np.argmax(angle <= usual)) if angle[0] > JUMP * usual else 0
 
 
-def _direct(motion: MotionRecord, body: BodyRecord, names: tuple[str, ...]) -> bool:
-    """Whether the motion's joints are the body's, in their order or by their names, with the same rest pose if it says."""
+def _has_joints_of(motion: MotionRecord, body: BodyRecord, names: tuple[str, ...]) -> bool:
+    """Tell whether the motion's joints are the body's, in order or by name, with the same rest places if it has any."""
     if motion.poses.shape[1] != len(body.parents):
         return False
     order = list(range(len(body.parents)))
@@ -111,8 +109,8 @@ def _direct(motion: MotionRecord, body: BodyRecord, names: tuple[str, ...]) -> b
     return bool(np.abs(ours - theirs).max() < 0.01 * np.abs(ours).max())
 
 
-def _smpl(motion: MotionRecord, body: BodyRecord) -> MotionRecord | None:
-    """A motion of SMPL's joints for a body of SMPL's with another number of them; None where either is not."""
+def _between_smpl(motion: MotionRecord, body: BodyRecord) -> MotionRecord | None:
+    """Return a motion of SMPL's joints for a SMPL body with more or fewer joints; None where either is not SMPL's."""
     theirs, ours = smpl_names(motion.poses.shape[1]), smpl_names(len(body.parents))
     if not theirs or not ours or motion.joints is not None or motion.joint_names not in ((), theirs):
         return None
@@ -127,8 +125,8 @@ def _smpl(motion: MotionRecord, body: BodyRecord) -> MotionRecord | None:
     return replace(motion, poses=poses, joint_names=(), notes=tuple(notes))
 
 
-def _of_package(motion: MotionRecord) -> MotionRecord:
-    """With the skeleton of the packaged body, where it has none and its joints are called so."""
+def _with_packaged_skeleton(motion: MotionRecord) -> MotionRecord:
+    """Add the packaged body's skeleton to a motion that has none, where its joints have that body's names."""
     if motion.joints is None and motion.joint_names:
         body = read_body(packaged("body"))
         if motion.joint_names == body.joint_names:
@@ -137,7 +135,7 @@ def _of_package(motion: MotionRecord) -> MotionRecord:
 
 
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
-    """A motion at the scene's frame rate, of the body's joints, see `casting.cast`."""
+    """Read a motion of the scene for its body, see `retarget_to_body`, and resample it to the scene's frame rate."""
     path, spec = scene.path(name), scene.motion
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
@@ -153,7 +151,7 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
     if speed > 100:
         raise InputError(
             "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
-            mend="divide centimetres by 100, or say motion.scale = 0.01",
+            mend="divide centimetres by 100, or write motion.scale = 0.01 into the scene file",
         )  # fmt: skip
     poses, translation = record.poses, record.translation
     if record.fps != scene.motion.fps:
@@ -166,7 +164,7 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
 
 
 def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
-    """The joint on the other side of each joint: by names (left/right, L_/R_), else by mirrored rest positions (x to -x)."""
+    """Return each joint's partner on the other side: by names (left/right, L_/R_), else by mirrored rest places (x to -x)."""
     if names:
         lower = [n.lower() for n in names]
         place = {n: i for i, n in enumerate(lower)}

@@ -14,13 +14,13 @@ from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
 
-__all__ = ["Retargeted", "body_names", "retarget", "turned", "upright_turn", "with_skeleton"]
+__all__ = ["Retargeted", "body_names", "retarget", "turn_note", "up_rotation", "with_skeleton"]
 
 # The bones that are aligned at rest, from the trunk outward: the role at either end.
 LIMBS = {"arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 LEG = 0.5, 1.1  # m from hip to ankle of a grown person, to tell units apart
-SAMPLES = 2000  # frames, at least, in which the soles are looked at
+SAMPLES = 2000  # frames; a longer motion has its soles measured in this many at least
 
 # SMPL's joints of a person of 1.7 m in T-pose, facing +Z, the left at +X, by the segment lengths of Drillis and Contini (1966):
 # for motions that come without a skeleton. Fingers, jaw and eyes are where they hang.
@@ -48,7 +48,7 @@ class Retargeted:
 
 
 def body_names(body: BodyRecord) -> tuple[str, ...]:
-    """The joints' names: the body's own, or SMPL's where it has none and its joints hang together as SMPL's do."""
+    """Return the joints' names: the body's own, or SMPL's where it has none and its joints form SMPL's tree; else none."""
     if body.joint_names:
         return body.joint_names
     names = smpl_names(len(body.parents))
@@ -56,10 +56,12 @@ def body_names(body: BodyRecord) -> tuple[str, ...]:
 
 
 def with_skeleton(motion: MotionRecord, wanted: int) -> MotionRecord:
-    """The same with names and rest joints: its own, or without any those of a person in SMPL's T-pose, where it is SMPL's.
+    """Add names and rest joints to a motion without them, where it has SMPL's joints: those of a person in SMPL's T-pose.
+
+    A motion that has both stays as it is. `wanted` is how many joints the body has, for the error.
 
     Raises:
-        InputError: it has no skeleton, and is not of SMPL's joints; nor of the `wanted` ones of the body.
+        InputError: the motion has no skeleton, and its joints are not SMPL's.
     """
     if motion.joints is not None and motion.joint_names:
         return motion
@@ -91,25 +93,61 @@ def retarget(
 ) -> Retargeted:
     """Drive a body by a motion of another skeleton.
 
-    Joints are paired by name, see `joint_names`; a body joint without a partner stays at rest, and what the motion's joints
-    between two paired ones turn is part of the next. With R_s the world rotation of a joint of the source since its rest,
+    Joints are paired by name, see `joint_names`. A body joint without a partner stays at rest. What the motion's joints between
+    two paired ones turn is part of the next pair's turn. With R_s the world rotation of a source joint since its rest,
 
-        R_t = U R_s A,
+        R_t = U R_s A.
 
-    A takes the body's rest to the source's: of the trunk, the quarter turns between their axes; of upper arm, forearm, thigh
-    and shin, besides, the least rotation that lays the one bone at rest along the other, so that its direction is the source's
-    in every frame; of a foot, a turn about the vertical only, as both stand on the ground, unless the two point 45 degrees
-    apart. U turns the source's up to the world's. The path of the hips is scaled by the ratio of the legs, hip to ankle, and
-    moved up or down so that the lowest sole (but for a twentieth of the frames) is as high as the soles are at rest.
+    A takes the body's rest pose to the source's. For the trunk it is the quarter turns between the axes of both. Upper arm,
+    forearm, thigh and shin add the least rotation that lays one bone at rest along the other, so that the bone's direction is
+    the source's in every frame. A foot adds a turn about the vertical only, as both stand on the ground, unless the two feet
+    point 45 degrees apart. U turns the source's up to the world's. The path of the hips is scaled by the ratio of the legs, hip
+    to ankle, and moved up or down until the lowest sole, in 19 of 20 frames, is no lower than the soles are at rest.
 
     Args:
         motion: with names and skeleton, see `with_skeleton`; lengths in any unit. body: with names, or SMPL's joints.
-        joints: the body's joint, by name or number, for a joint of the motion, "" for none, in place of what the names say.
-        scale: m for each unit of the motion's lengths; 0: by the legs. up: axis of the motion's world, "y" or "z"; "": the
-            motion's own, else z where its skeleton stands along z, at rest and moving. world: the axis that points up here.
+        joints: the body's joint, by name or number, for a joint of the motion, "" for none; it overrides the pairs by name.
+        scale: m for each unit of the motion's lengths; 0: found from the legs. up: axis of the motion's world, "y" or "z"; "":
+            the motion's own, else z where its skeleton stands along z, at rest and moving. world: the axis that points up here.
 
     Raises:
         InputError: no names, names that do not match, or overrides that name no joint of the body.
+    """
+    joints, names = joints or {}, body_names(body)
+    source, target, pairs = _paired(motion, body, joints)
+    turns, places = _forward(motion)
+    axes = _body_axes(body.joints, target)
+    quarter = _body_axes(motion.joints, source) @ axes.T
+    upright = up_rotation(up or motion.up or _up_axis(places, motion.joints, source), world)
+    align = _alignment(motion, body, source, target, pairs, quarter, axes)
+    world_turns, local = _driven(turns, body, pairs, upright, align)
+
+    legs = _leg_length(source, motion.joints)
+    scaled_by = "as the scene says" if scale else "by the legs" if legs > 0 else "by the trunk"
+    scale = scale or _leg_ratio(motion, body, source, target)
+    hips_s, hips_t = source.roles["hips"], target.roles["hips"]
+    home = body.joints[hips_t] - scale * quarter.T @ motion.joints[hips_s]
+    bodily = replace(motion, poses=local, translation=np.zeros((len(turns), 3)), joints=body.joints, parents=body.parents)
+    offsets = _forward(bodily, world_turns)[1]  # with the root at its rest place
+    translation = home + scale * places[:, hips_s] @ upright.T - offsets[:, hips_t]
+    height = "xyz".index(world)
+    soles = _sole_heights(body, target, world_turns, offsets + translation[:, None], height, axes[:, 1])
+    low = np.percentile(soles, 5)
+    translation[:, height] -= low
+    driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
+    still = tuple(n for n in names if n not in driven)
+    unused = tuple(n for n in motion.joint_names if n not in set(driven.values()))
+    result = Retargeted(MotionRecord(local, translation, motion.fps, names), driven, still, unused, scale)
+    notes = [*_notes(result, motion, legs, scaled_by, float(soles.max() - low))]
+    if absent := [n for n in joints if n not in motion.joint_names]:
+        notes.append(f"motion.joints names joints that this motion does not have: {', '.join(absent)}")
+    return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright))))
+
+
+def _paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -> tuple[Limbs, Limbs, dict[int, int]]:
+    """Return the limbs of the motion's skeleton and of the body, and the motion's joint of each body joint that is driven.
+
+    A joint of the motion that an override pairs with the body's takes that joint's role.
     """
     names = body_names(body)
     if not names:
@@ -118,66 +156,41 @@ def retarget(
             mend="write joint_names (J,) into the body's file",
         )  # fmt: skip
     source, target = anatomy(motion.joint_names, motion.parents.tolist()), anatomy(names, body.parents.tolist())
-    joints = joints or {}
-    foreign = [n for n in joints if n not in motion.joint_names]
-    lost = [f"joints that motion.joints names and this motion has not: {', '.join(foreign)}"] if foreign else []
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
-    hips_s, hips_t = source.roles["hips"], target.roles["hips"]
-    if hips_t not in pairs or len(pairs) < min(3, len(names)):
+    if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
         raise InputError(
             "joint names that say what they are expected", field="joint_names", value=list(motion.joint_names),
             mend=f"pair them with the body's by motion.joints in the scene file; the body has {', '.join(names)}",
         )  # fmt: skip
-    turns, places = _forward(motion)
-    axes = _axes(body.joints, target)
-    quarter = _axes(motion.joints, source) @ axes.T
-    upright = upright_turn(up or motion.up or _standing(places, motion.joints, source), world)
-    align = _alignment(motion, body, source, target, pairs, quarter, axes)
+    return source, target, pairs
 
-    frames, count = len(turns), len(names)
-    world_turns = np.zeros((frames, count, 3, 3))
-    local = np.zeros((frames, count, 3))
+
+def _driven(turns: np.ndarray, body: BodyRecord, pairs: dict[int, int], upright, align) -> tuple[np.ndarray, np.ndarray]:
+    """Return the body's world rotations (T, J, 3, 3), and its local ones (T, J, 3) as axis times angle in the joints' axes."""
+    frames, count = len(turns), len(body.parents)
+    world_turns, local = np.zeros((frames, count, 3, 3)), np.zeros((frames, count, 3))
     for j, parent in enumerate(body.parents):
         above = world_turns[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (frames, 3, 3))
         world_turns[:, j] = upright @ turns[:, pairs[j]] @ align[j] if j in pairs else above
-        if j in pairs:  # of the others exactly zero: a joint that never turns tells the network nothing
+        if j in pairs:  # the others stay exactly zero: a joint that never turns tells the network nothing
             own = np.swapaxes(above, 1, 2) @ world_turns[:, j]
             if body.rest_rotations is not None:
                 own = body.rest_rotations[j].T @ own @ body.rest_rotations[j]
             local[:, j] = Rotation.from_matrix(own).as_rotvec()
             if np.ptp(local[:, j], axis=0).max() < 1e-7:
                 local[:, j] = np.where(np.abs(local[0, j]) < 1e-7, 0, local[0, j])
-
-    by = "as the scene says" if scale else "by the legs" if _leg(source, motion.joints) > 0 else "by the trunk"
-    scale = scale or _leg_ratio(motion, body, source, target)
-    home = body.joints[hips_t] - scale * quarter.T @ motion.joints[hips_s]
-    path = home + scale * places[:, hips_s] @ upright.T
-    bodily = replace(motion, poses=local, translation=np.zeros((frames, 3)), joints=body.joints, parents=body.parents)
-    offsets = _forward(bodily, world_turns)[1]  # with the root at its rest place
-    translation = path - offsets[:, hips_t]
-    axis = "xyz".index(world)
-    soles = _soles(body, target, world_turns, offsets + translation[:, None], axis, axes[:, 1])
-    low = np.percentile(soles, 5)
-    translation[:, axis] -= low
-    driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
-    moved = MotionRecord(local, translation, motion.fps, names)
-    result = Retargeted(
-        moved, driven, tuple(n for n in names if n not in driven),
-        tuple(n for n in motion.joint_names if n not in set(driven.values())), scale,
-    )  # fmt: skip
-    notes = (*_notes(result, motion, source, by, float(soles.max() - low)), *lost, *turned(upright))
-    return replace(result, motion=replace(moved, notes=notes))
+    return world_turns, local
 
 
-def upright_turn(up: str, world: str) -> np.ndarray:
-    """The quarter turn about x that takes one axis that points up to another: from Z up to Y up, (x, y, z) to (x, z, -y)."""
+def up_rotation(up: str, world: str) -> np.ndarray:
+    """Return the quarter turn about x from one axis that points up to another: Z up to Y up takes (x, y, z) to (x, z, -y)."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return np.eye(3) if up == world else turn if world == "y" else turn.T
 
 
-def turned(turn: np.ndarray) -> tuple[str, ...]:
-    """That turn in words; none where nothing turns."""
+def turn_note(turn: np.ndarray) -> tuple[str, ...]:
+    """Describe a turn of `up_rotation` in a note; none where nothing turns."""
     return () if turn[1, 1] else ("turned from Z up to Y up" if turn[1, 2] > 0 else "turned from Y up to Z up",)
 
 
@@ -190,7 +203,7 @@ QUARTERS = [q for q in QUARTERS if np.linalg.det(q) > 0]  # the 24 rotations of 
 
 
 def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[str, ...], joints: Mapping[str, str]) -> dict:
-    """The pairs with what the user says of joints of this motion; a joint drives what he says and nothing else."""
+    """Return the pairs after the user's overrides: a joint that they name drives what they say and nothing else."""
     for theirs, ours in joints.items():
         number = target.index(ours) if ours in target else int(ours) if ours.isdigit() else -1
         if ours and not 0 <= number < len(target):
@@ -204,8 +217,8 @@ def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[st
 
 
 def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
-    known = turns is not None
+    """Return world rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
+    given = turns is not None
     if turns is None:
         turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix()
         turns = turns.reshape(*motion.poses.shape, 3)
@@ -216,14 +229,14 @@ def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.
         if parent < 0:
             places[:, j] = motion.joints[j] + motion.translation
             continue
-        if not known:
+        if not given:
             turns[:, j] = turns[:, parent] @ turns[:, j]
         places[:, j] = places[:, parent] + turns[:, parent] @ (motion.joints[j] - motion.joints[parent]).astype(np.float64)
     return turns, places
 
 
-def _axes(joints: np.ndarray, of: Limbs) -> np.ndarray:
-    """Columns that point left, up and forward of a skeleton at rest, along the axes of coordinates that are nearest."""
+def _body_axes(joints: np.ndarray, of: Limbs) -> np.ndarray:
+    """Return columns that point left, up and forward of a skeleton at rest, each along the nearest axis of coordinates."""
     sides = [
         joints[of.roles[f"left {r}"]] - joints[of.roles[f"right {r}"]]
         for r in ("thigh", "arm")
@@ -240,18 +253,19 @@ def _axes(joints: np.ndarray, of: Limbs) -> np.ndarray:
 
 
 def _top(of: Limbs) -> int:
+    """Return the highest joint of the trunk: the head, else the last of the neck, of the spine, or the hips."""
     return of.roles["head"] if "head" in of.roles else (of.neck or of.spine or (of.roles["hips"],))[-1]
 
 
-def _standing(places: np.ndarray, joints: np.ndarray, of: Limbs) -> str:
-    """The axis of the world that points up: z where hips to head are along it both at rest and on average, else y."""
+def _up_axis(places: np.ndarray, joints: np.ndarray, of: Limbs) -> str:
+    """Return the axis of the world that points up: z where hips to head lie along it at rest and on average, else y."""
     rest = joints[_top(of)] - joints[of.roles["hips"]]
     mean = (places[:, _top(of)] - places[:, of.roles["hips"]]).mean(axis=0)
     return "z" if all(d[2] > 2 * np.abs(d[:2]).max() for d in (rest, mean)) else "y"
 
 
 def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The least rotation that takes direction a to b; of opposite ones, half a turn about an axis in the frontal plane."""
+    """Return the least rotation that takes direction a to b; half a turn where they are opposite."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     axis, cosine = np.cross(a, b), a @ b
     if cosine < -1 + 1e-9:
@@ -262,7 +276,7 @@ def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int], quarter, axes) -> np.ndarray:
-    """A of each body joint (J, 3, 3), from its rest to that of its partner."""
+    """Return A of each body joint (J, 3, 3), from its rest to that of its partner, see `retarget`."""
     role = {j: word for word, j in target.roles.items()}
     align = np.broadcast_to(quarter, (len(body.parents), 3, 3)).copy()
     for j, parent in enumerate(body.parents):
@@ -276,31 +290,31 @@ def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int]
         if part == "foot":
             align[j] = quarter
             if ours is not None and theirs is not None:
-                align[j] = quarter @ axes @ _foot(axes.T @ ours, axes.T @ quarter.T @ theirs) @ axes.T
+                align[j] = quarter @ axes @ _foot_rotation(axes.T @ ours, axes.T @ quarter.T @ theirs) @ axes.T
         elif ours is not None and theirs is not None:
             align[j] = _least_turn(align[j] @ ours, theirs) @ align[j]
     return align
 
 
 def _bone(of: Limbs, end: str, joints, tips, j: int) -> np.ndarray | None:
-    """From a joint to where its bone ends: the joint of that role, or the tip; None where nothing says."""
+    """Return the vector from a joint to its bone's end: the joint of that role, or the tip; None where neither is known."""
     place = joints[of.roles[end]] if of.roles.get(end, j) != j else joints[j] if tips is None else tips[j]
     bone = (place - joints[j]).astype(np.float64)
     return bone if np.linalg.norm(bone) > 0 else None
 
 
-def _foot(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """From the direction of the body's foot at rest to the source's, both as left, up and forward."""
+def _foot_rotation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Return the rotation from the body's foot at rest to the source's; both directions are given as left, up, forward."""
     flat, other = ours * (1, 0, 1), theirs * (1, 0, 1)
     if np.linalg.norm(other) < 0.2 * np.linalg.norm(theirs) or np.linalg.norm(flat) == 0:
-        return np.eye(3)  # straight down: it ends in the sole, and says nothing of where the toes are
+        return np.eye(3)  # straight down: the bone ends in the sole, and does not tell where the toes are
     turn = _least_turn(flat, other)
     apart = _least_turn(turn @ ours, theirs)
     return apart @ turn if np.trace(apart) < 1 + 2 * np.cos(np.pi / 4) else turn
 
 
-def _leg(of: Limbs, joints: np.ndarray) -> float:
-    """Hip to ankle along the bones, the mean of both sides; NaN without legs."""
+def _leg_length(of: Limbs, joints: np.ndarray) -> float:
+    """Return the length from hip to ankle along the bones, the mean of both sides; NaN without legs."""
     lengths = []
     for side in ("left", "right"):
         chain = [of.roles.get(f"{side} {part}") for part in ("thigh", "shin", "foot")]
@@ -310,8 +324,8 @@ def _leg(of: Limbs, joints: np.ndarray) -> float:
 
 
 def _leg_ratio(motion: MotionRecord, body: BodyRecord, source: Limbs, target: Limbs) -> float:
-    """Metres on the body for each unit of the source: by the legs, else by the trunk from hips to head."""
-    ours, theirs = _leg(target, body.joints), _leg(source, motion.joints)
+    """Return metres on the body for each unit of the source: by the legs, else by the trunk from hips to head."""
+    ours, theirs = _leg_length(target, body.joints), _leg_length(source, motion.joints)
     if not (np.isfinite(ours) and theirs > 0):
         ours, theirs = (
             float(np.linalg.norm(x[_top(a)] - x[a.roles["hips"]]))
@@ -322,8 +336,11 @@ def _leg_ratio(motion: MotionRecord, body: BodyRecord, source: Limbs, target: Li
     return ours / theirs
 
 
-def _soles(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarray, axis: int, up) -> np.ndarray:
-    """How high (m) the lowest sole is in a frame over where soles are at rest, along the body's `up`; of some, if many."""
+def _sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarray, axis: int, up) -> np.ndarray:
+    """Return how high (m) the lowest sole is above where soles are at rest, frame by frame; every few frames of a long motion.
+
+    Heights are along the world's `axis` in motion and along the body's `up` at rest.
+    """
     every = slice(None, None, 1 + len(turns) // SAMPLES)
     feet = {target.roles[f"{side} foot"] for side in ("left", "right") if f"{side} foot" in target.roles}
     for j, parent in enumerate(body.parents):
@@ -339,8 +356,8 @@ def _soles(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarra
     return heights.min(axis=1) - (points @ up).min()
 
 
-def _notes(result: Retargeted, motion: MotionRecord, source: Limbs, by: str, rise: float) -> tuple[str, ...]:
-    """What was done, in words."""
+def _notes(result: Retargeted, motion: MotionRecord, leg: float, scaled_by: str, rise: float) -> tuple[str, ...]:
+    """Describe what was done; `leg` is the length of the motion's legs in its own unit, `rise` in m."""
     count = len(result.pairs) + len(result.still)
     pairs = [o if o == t else f"{o} by {t}" for o, t in result.pairs.items()]
     notes = [f"retargeted by joint names, {len(pairs)} of the body's {count} joints are driven: {', '.join(pairs)}"]
@@ -348,11 +365,10 @@ def _notes(result: Retargeted, motion: MotionRecord, source: Limbs, by: str, ris
         notes.append(f"at rest, as nothing drives them: {', '.join(result.still)}")
     if result.unused:
         notes.append(f"joints of the motion that drive nothing: {', '.join(result.unused)}")
-    leg = _leg(source, motion.joints)
     unit = min(UNITS, key=lambda u: abs(np.log(leg * UNITS[u] / 0.8))) if leg > 0 else "m"
-    like = LEG[0] < leg * UNITS[unit] < LEG[1]
-    told = f" (it seems to be in {unit})" if like and unit != "m" else ""
-    legs = f", {by}; hip to ankle is {leg:.4g} units{told}" if leg > 0 else f", {by}"
+    plausible = LEG[0] < leg * UNITS[unit] < LEG[1]
+    guess = f" (it seems to be in {unit})" if plausible and unit != "m" else ""
+    legs = f", {scaled_by}; hip to ankle is {leg:.4g} units{guess}" if leg > 0 else f", {scaled_by}"
     notes.append(f"a unit of its lengths is {result.scale:.4g} m here{legs}")
-    notes.append(f"its lowest sole is where soles are at rest; in other frames the lower foot is up to {rise:.2f} m higher")
+    notes.append(f"the lowest sole is as high as at rest; in other frames the lower foot is up to {rise:.2f} m higher")
     return tuple(notes)

@@ -1,7 +1,7 @@
-"""How near a scene is to where things break: what `ncs check` says beside what is in it.
+"""What puts a scene at risk: its material, mesh, fit and motions against ranges that are known to be safe.
 
-The ranges are those of the stability map (`experiments/stability.py`): inside, float32 agrees with float64 to a thousandth and
-nothing fails; outside, a scene is at risk. What cannot work at all is refused when it is read.
+The ranges are those of the stability map (`experiments/stability.py`). Inside them float32 agrees with float64 to a thousandth
+and nothing fails; outside them a scene is at risk. What cannot work at all is refused when the files are read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ncs_jax.prepare.build import Assembly, features_from_records
 from ncs_jax.scene.model import Model, local_rotations, pose_body
 from ncs_jax.scene.spec import Scene
 
-__all__ = ["RANGES", "Finding", "findings"]
+__all__ = ["RANGES", "Risk", "find_risks"]
 
 # quantity: (least, most) that is safe
 RANGES = {
@@ -32,19 +32,19 @@ RANGES = {
     "stiffness": (1e-3, 1e4),  # times the default
     "gravity": (0.0, 100 * 9.81),  # m/s^2
     "size": (0.01, 100.0),  # m
-    "way": (0.0, 1000.0),  # m from where a motion begins
+    "distance from the start": (0.0, 1000.0),  # m from where a motion begins
     "height of a triangle": (1e-3, 1.0),  # of its longest edge
 }
-DEEP = 0.01  # m inside the body, where the body alone carries the garment,
-MANY = 0.02  # that so many of its vertices may be
-LEAP = 0.3  # m within a frame, which is a limb's thickness
+DEEP = 0.01  # m that vertices may be inside the body, where the body alone carries the garment,
+MANY = 0.02  # and the share of the vertices that may be deeper
+JUMP = 0.3  # m within a frame: the thickness of a limb
 TURN = 90.0  # degrees within a frame
-POSES = 8  # of every motion that are looked at
+POSES = 8  # checked in every motion
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What puts a scene at risk: the quantity, what it is here, what may happen, and the mend."""
+class Risk:
+    """A quantity that puts a scene at risk: its name, its value here, what may happen, and the mend."""
 
     what: str
     value: str
@@ -52,22 +52,24 @@ class Finding:
     mend: str
 
 
-def _outside(name: str, value: float, shown: str, risk: str, mend: str) -> Iterator[Finding]:
+def _outside(name: str, value: float, shown: str, risk: str, mend: str) -> Iterator[Risk]:
+    """Yield a risk where a value is outside the safe range of its quantity."""
     low, high = RANGES[name]
     if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6):
-        yield Finding(name, f"{shown} (safe: {low:.4g} to {high:.4g})", risk, mend)
+        yield Risk(name, f"{shown} (safe: {low:.4g} to {high:.4g})", risk, mend)
 
 
-def _material(scene: Scene) -> Iterator[Finding]:
+def _material(scene: Scene) -> Iterator[Risk]:
+    """Yield the risks of the time step, the density, gravity and the stiffnesses."""
     physics, default, fps = scene.physics, Scene().physics, scene.motion.fps
     rounding = "forces of very different size are added in single precision"
     yield from _outside(
-        "time step", 1 / fps, f"1/{fps:g} s", "the energy of inertia is far from that of the cloth", "motion.fps from 5 to 240"
+        "time step", 1 / fps, f"1/{fps:g} s", "inertia's energy and the cloth's differ very much", "motion.fps from 5 to 240"
     )
     if scene.network.method == "ncs" and scene.network.cell != "swing" and physics.inertia:
         yield from _outside(
-            "time step of a recurrence", 1 / fps, f"1/{fps:g} s", "inertia against its own past feeds on itself",
-            'network.cell = "swing", or motion.fps up to 15: what it learned may be used at any frame rate',
+            "time step of a recurrence", 1 / fps, f"1/{fps:g} s", "errors may grow: inertia acts on the network's own past",
+            'network.cell = "swing", or motion.fps up to 15; a trained network runs at any frame rate',
         )  # fmt: skip
     yield from _outside("density", physics.density, f"{physics.density:g} kg/m^2", rounding, "physics.density")
     pull = float(np.linalg.norm(physics.gravity))
@@ -84,10 +86,11 @@ def _material(scene: Scene) -> Iterator[Finding]:
             yield from _outside("stiffness", value / usual, f"{value / usual:.3g} times the default", rounding, field)
 
 
-def _mesh(a: Assembly) -> Iterator[Finding]:
+def _mesh(a: Assembly) -> Iterator[Risk]:
+    """Yield the risks of the garment's size and of triangles and vertices that are degenerate."""
     x, faces = np.asarray(a.garment.vertices, np.float64), np.asarray(a.garment.faces)
     size = float(np.ptp(x, axis=0).max())
-    yield from _outside("size", size, f"{size:.3g} m", "thicknesses and stiffnesses are of another scale", "scale it to metres")
+    yield from _outside("size", size, f"{size:.3g} m", "thicknesses and stiffnesses are meant for metres", "scale it to metres")
     edges = np.linalg.norm(x[faces] - x[np.roll(faces, 1, axis=1)], axis=-1)
     double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=-1)
     longest = edges.max(axis=1)
@@ -95,19 +98,19 @@ def _mesh(a: Assembly) -> Iterator[Finding]:
     clean = "clean the mesh where it was made"
     flat = int((slim <= LINE).sum())
     if flat:
-        yield Finding("triangles of no area", str(flat), "they weigh nothing and resist nothing", clean)
+        yield Risk("triangles of no area", str(flat), "they weigh nothing and resist nothing", clean)
     worst = float(slim[slim > LINE].min(initial=1.0))
     count = int((slim[slim > LINE] < RANGES["height of a triangle"][0]).sum())
     shown = f"{worst:.1e} of its longest edge, {count} such"
-    yield from _outside("height of a triangle", worst, shown, "its strain is rounding", clean)
+    yield from _outside("height of a triangle", worst, shown, "its strain is lost in rounding", clean)
     twice = len(x) - len(np.unique(x, axis=0))
     if twice:
-        yield Finding("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
+        yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
 
 
 @jax.jit
 def _depths(model: Model, matrices):
-    """Signed distances to the body of the garment as the body alone carries it, frame by frame, m."""
+    """Return signed distances (frames, verts), m, to the body of the garment as the body alone carries it."""
 
     def depth(matrices):
         x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
@@ -117,44 +120,47 @@ def _depths(model: Model, matrices):
     return jax.lax.map(depth, matrices)
 
 
-def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Finding]:
+def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Risk]:
+    """Yield a risk where, in some pose, a share `many` of the garment is more than `deep` (m) inside the body."""
     still = [MotionRecord(pose[None], np.zeros((1, 3), poses.dtype), model.fps) for pose in poses]
     depth = -np.asarray(_depths(model, features_from_records(model, *still).matrices))
     share = float((depth > deep).mean(axis=1).max())
     if share > many:
         value = f"{100 * share:.1f} % of its vertices by more than {1000 * deep:.0f} mm, up to {1000 * depth.max():.1f} mm"
-        yield Finding(f"garment inside the body {when}", value, "contact pushes out on whichever side is nearer", mend)
+        yield Risk(f"garment inside the body {when}", value, "contact pushes it out on the nearer side, right or wrong", mend)
 
 
-def _motion(a: Assembly, name: str) -> Iterator[Finding]:
+def _motion(a: Assembly, name: str) -> Iterator[Risk]:
+    """Yield the risks of a motion: how far it goes, jumps and turns within a frame, cloth inside the body."""
     from scipy.spatial.transform import Rotation
 
     record, model = a.motions[name], a.model
-    way = record.translation.astype(np.float64)
-    far = float(np.linalg.norm(way - way[:1], axis=1).max())
-    yield from _outside("way", far, f"{far:.0f} m in {name}", "positions are rounded to more than 0.1 mm", "cut the motion")
-    leap = np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0)
-    if leap > LEAP:
-        value = f"{leap:.2f} m in {name}, frame {1 + int(np.linalg.norm(np.diff(way, axis=0), axis=1).argmax())}"
-        yield Finding("leap within a frame", value, "cloth is left behind and torn after", "cut the motion there")
+    path = record.translation.astype(np.float64)
+    far = float(np.linalg.norm(path - path[:1], axis=1).max())
+    rounding = "positions are rounded to more than 0.1 mm"
+    yield from _outside("distance from the start", far, f"{far:.0f} m in {name}", rounding, "cut the motion")
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    if steps.max(initial=0) > JUMP:
+        value = f"{steps.max():.2f} m in {name}, frame {1 + int(steps.argmax())}"
+        yield Risk("jump within a frame", value, "the cloth is left behind, then torn along", "cut the motion there")
     local = np.asarray(local_rotations(model, jnp.asarray(record.poses, model.basis.dtype)))
     if len(local) > 1:
-        steps = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
-        turn = np.degrees(Rotation.from_matrix(steps.reshape(-1, 3, 3)).magnitude()).reshape(steps.shape[:2])
+        turns = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
+        turn = np.degrees(Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()).reshape(turns.shape[:2])
         if turn.max() > TURN:
             frame, joint = np.unravel_index(turn.argmax(), turn.shape)
             number = model.source_joints[joint]
             label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
             value = f"{turn.max():.0f} degrees in {name}, frame {frame + 1}, joint {label}"
-            yield Finding("turn within a frame", value, "a limb passes through cloth", "clean the motion there")
+            yield Risk("turn within a frame", value, "a limb passes through cloth", "clean the motion there")
     if model.surface is not None:
         frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
         mend = "mend the pose, or smooth the skinning weights"
         yield from _inside(model, record.poses[frames], f"where the body alone carries it in {name}", DEEP, MANY, mend)
 
 
-def findings(a: Assembly) -> list[Finding]:
-    """All that puts a scene at risk, from its material, its mesh, its fit and its motions; none where it is safe."""
+def find_risks(a: Assembly) -> list[Risk]:
+    """Return all that puts a scene at risk, from its material, its mesh, its fit and its motions; none where it is safe."""
     found = [*_material(a.scene), *_mesh(a)]
     if a.model.surface is not None:
         joints = 1 if a.body is None else len(a.body.parents)

@@ -1,4 +1,4 @@
-"""Skinning weights of a garment from those of the body, and which joints they use."""
+"""A garment's skinning weights from those of the body, and the joints that they use."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.geometry.closest_point import closest_weights
+from ncs_jax.io.character.hierarchy import path_to_root
 
 __all__ = ["smooth_weights", "transfer_weights", "used_joints"]
 
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Skinning weights (verts, joints) of each garment vertex, interpolated at the nearest point of the body's **surface**."""
+    """Return a garment's skinning weights (verts, joints): the body's, interpolated at the nearest point of its **surface**."""
     surface = surface_from(garment, body, faces)
 
     @jax.jit
@@ -30,7 +31,7 @@ def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, w
 
 
 def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.ndarray:
-    """Replace each vertex's weights by the mean of its neighbours', `times` times over."""
+    """Replace each vertex's weights by the mean of its neighbours' weights, `times` times."""
     from scipy.sparse import coo_matrix, diags
 
     verts = len(weights)
@@ -44,9 +45,6 @@ def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.nda
 
 
 def used_joints(parents: Sequence[int], weights: np.ndarray, least: float = 0.01) -> tuple[int, ...]:
-    """The joints whose weight reaches `least` on some vertex of (verts, joints), with all their ancestors, in order."""
-    wanted = set(np.flatnonzero(np.asarray(weights).max(axis=0, initial=0) >= least).tolist())
-    for j in list(wanted):
-        while (j := int(parents[j])) >= 0:
-            wanted.add(j)
-    return tuple(sorted(wanted | {list(parents).index(-1)}))
+    """Return the joints whose weight (verts, joints) reaches `least` on some vertex, and all joints above them, in order."""
+    wanted = np.flatnonzero(np.asarray(weights).max(axis=0, initial=0) >= least).tolist()
+    return tuple(sorted({list(parents).index(-1)}.union(*(path_to_root(parents, j) for j in wanted))))

@@ -29,9 +29,9 @@ def touchable(
     rotations: Sequence[np.ndarray],
     reach: float,
 ) -> np.ndarray:
-    """Which body vertices come within `reach` (m) of the skinned rest garment in any of the given poses; (body,) bool.
+    """Return which body vertices (body,) come within `reach` (m) of the skinned rest garment in any of the given poses.
 
-    `rotations` are local ones, (joints, 3, 3) each; the rest pose is always looked at.
+    `rotations` holds the local rotations (joints, 3, 3) of every pose. The rest pose is always checked too.
     """
     from scipy.spatial import cKDTree
 
@@ -52,12 +52,12 @@ def touchable(
     return near
 
 
-COVER = 0.06  # m from the skin within which a garment below covers it,
-RIM = 0.1  # m from its rim at least
+COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
+RIM = 0.1  # m; but none that is nearer to its rim
 
 
 def touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.ndarray:
-    """Triangles of the part of the body and of the garments below, which face outward as the body does."""
+    """Return the triangles of the touchable part of the body and of the garments below, all facing outward."""
     from scipy.spatial import cKDTree
 
     faces, count = [_submesh(body.faces, part, len(body.vertices))], len(part)
@@ -71,10 +71,10 @@ def touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.n
 
 
 def covered_by_layers(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarray:
-    """Which body vertices (body,) a garment below lies over: the nearest point of it is in front of them and not at its rim.
+    """Return which body vertices (body,) a garment below covers: its nearest point is in front of them and not at its rim.
 
-    They are no part of what the garment above touches, as there is cloth between; with them, it would be held off by the skin
-    where it is through the cloth.
+    The garment above does not touch these vertices, because there is cloth between. If they stayed, the skin would hold it off
+    where it has passed through that cloth.
     """
     from scipy.spatial import cKDTree
 
@@ -90,7 +90,7 @@ def covered_by_layers(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarr
 
 
 def surface_of(model: Model, faces, track: MotionFeatures | None, smooth: bool, samples: int = 8) -> Surface:
-    """The touchable body, its search prepared for what comes near what in a few poses of the motion."""
+    """Return the touchable body as a surface, with its search prepared for what comes near in some poses of the motion."""
 
     def posed(matrices):
         return skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
@@ -109,8 +109,8 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
         return np.arange(len(body.vertices))
     skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
     poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(body.parents), 3), np.float32)
-    looked = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
-    local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(looked)))
+    some = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
+    local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(some)))
     if body.rest_rotations is not None:
         local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
     # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
@@ -129,7 +129,8 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
 
 
 def _submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:
-    place = np.full(verts, -1)
-    place[kept] = np.arange(len(kept))
-    inside = place[faces]
+    """Return the triangles of the kept vertices, which are numbered anew."""
+    number = np.full(verts, -1)
+    number[kept] = np.arange(len(kept))
+    inside = number[faces]
     return inside[(inside >= 0).all(axis=1)]

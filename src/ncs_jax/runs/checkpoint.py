@@ -22,7 +22,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.tables.npz import read_npz
-from ncs_jax.prepare.build import Prepared
+from ncs_jax.prepare.prepared import Prepared
 
 __all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
 

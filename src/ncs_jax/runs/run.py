@@ -16,8 +16,9 @@ from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
 from ncs_jax.network.rollout import animated, first_broken
-from ncs_jax.prepare.build import Assembly, Prepared, build, features_from_records
+from ncs_jax.prepare.build import Assembly, build, features_from_records
 from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.runs.checkpoint import Checkpoints, read_prepared, read_run
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model

@@ -40,7 +40,7 @@ ASSETS = Path(__file__).parents[1] / "assets"
 
 
 def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple = (), above: bool = False):
-    """A field with its help text and range; `above` excludes the lower end."""
+    """Return a field with its help text and range; `above` excludes the lower end."""
     meta = {"help": text, "low": low, "high": high, "choices": choices, "above": above}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: default, metadata=meta)
@@ -54,22 +54,22 @@ class BodySpec:
     """[body]: the character."""
 
     file: str = _f("ncs:body", "body file, ncs:NAME for a packaged one, or 'none' for a garment without a body")
-    joints: tuple[str, ...] = _f((), "names or numbers of the joints that the network reads; empty: those that matter")
+    joints: tuple[str, ...] = _f((), "names or numbers of joints that the network reads; empty: those that move the garment")
     part: str = _f("auto", "part of the body that the garment can touch", choices=("auto", "all"))
 
 
 @dataclass(frozen=True)
 class GarmentSpec:
-    """[garment]: what it wears."""
+    """[garment]: what the character wears."""
 
     file: str = _f("ncs:tshirt", "garment mesh in its rest shape on the resting body")
     scale: float = _f(0.0, "metres a unit of the file, 0.01 for cm; 0: as the file says, else 1", low=0, high=1e6)
     up: str = _f("", "axis that is up in the file; empty: as the file says, else y", choices=("", "x", "y", "z"))
-    weld: float = _f(0.0, "vertices within it of each other become one, m; 0: none", low=0, high=1)
-    smoothing: int = _f(10, "how many times the skinning weights are averaged over the garment", low=0, high=10000)
+    weld: float = _f(0.0, "merge vertices within this distance of each other, m; 0: none", low=0, high=1)
+    smoothing: int = _f(10, "how often each vertex's skinning weights become its neighbours' mean", low=0, high=10000)
     pins: str = _f("", "name of the vertex group that is pinned; empty: none")
     learn_weights: bool = _f(False, "train the skinning weights too")
-    over: tuple[str, ...] = _f((), "run folders of the garments below it, trained before, which collide as part of the body")
+    over: tuple[str, ...] = _f((), "run folders of trained garments worn below this one; they collide as part of the body")
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,15 @@ class MotionSpec:
     """[motion]: what the character does."""
 
     files: tuple[str, ...] = _f(("ncs:walk",), "motions to train on; empty: the character stands still in its rest pose")
-    validation: tuple[str, ...] = _f((), "motions that are only looked at")
+    validation: tuple[str, ...] = _f((), "motions to validate on, not to train on")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
     mirror: bool = _f(False, "train on the mirror image of every motion too")
     frames: tuple[int, ...] = _f(
-        (), "first frame, and the one after the last, of every file; empty: all of it", low=0, high=10**9
+        (), "first frame to use of every file, and the frame to stop before; empty: all frames", low=0, high=10**9
     )
-    scale: float = _f(0.0, "m for each unit of a file's lengths; 0: metres, of another skeleton by its legs", low=0, high=1e6)
+    scale: float = _f(0.0, "metres a unit of the files; 0: 1, or by the legs for another skeleton", low=0, high=1e6)
     up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"))
-    joints: dict[str, str] = _f({}, 'the body\'s joint for a joint of a motion, where names do not tell; "": none')
+    joints: dict[str, str] = _f({}, 'the body\'s joint for a joint of a motion, where names do not tell; "" for none')
 
 
 @dataclass(frozen=True)
@@ -102,34 +102,34 @@ class MembraneSpec:
 
 @dataclass(frozen=True)
 class BendingSpec:
-    """[physics.bending]."""
+    """[physics.bending]: resistance to bending."""
 
     stiffness: float = _f(1e-5, "bending stiffness, N m; 0: no bending", low=0, high=1e6)
 
 
 @dataclass(frozen=True)
 class CollisionSpec:
-    """[physics.collision]."""
+    """[physics.collision]: contact with the body."""
 
     stiffness: float = _f(10.0, "k_c, J/m^2 a vertex; 0: no collision", low=0, high=1e9)
     thickness: float = _f(0.004, "distance to keep from the body, m", low=0, high=0.1)
     distance: str = _f("plane", "signed distance to the body", choices=("plane", "smooth", "triangle"))
     search: str = _f("exact", "search for the nearest feature", choices=("exact", "candidates"))
     friction: float = _f(0.0, "coefficient of friction between garment and body; 0: none", low=0, high=10)
-    reach: float = _f(0.08, "how near to the skinned garment the body can be touched, m", low=0.005, high=10)
+    reach: float = _f(0.08, "the body can be touched within this distance of the skinned garment, m", low=0.005, high=10)
 
 
 @dataclass(frozen=True)
 class SelfContactSpec:
-    """[physics.self_contact]."""
+    """[physics.self_contact]: contact of the garment with itself."""
 
     stiffness: float = _f(0.0, "k_s, J/m^2 a pair; 0: cloth passes through cloth", low=0, high=1e9)
-    thickness: float = _f(0.003, "distance of cloth from cloth, m", low=0, high=0.1, above=True)
+    thickness: float = _f(0.003, "distance to keep between cloth and cloth, m", low=0, high=0.1, above=True)
 
 
 @dataclass(frozen=True)
 class PinningSpec:
-    """[physics.pinning]."""
+    """[physics.pinning]: springs that hold pinned vertices."""
 
     stiffness: float = _f(1000.0, "k_p, N/m a pinned vertex", low=0, high=1e9)
 
@@ -152,30 +152,30 @@ class PhysicsSpec:
 class NetworkSpec:
     """[network]: the method, and the sizes of its networks."""
 
-    method: str = _f("ncs", "ncs; pbns, a pose without motion; snug, one recurrent network", choices=("ncs", "pbns", "snug"))
+    method: str = _f("ncs", "ncs; pbns, of the pose alone; snug, one recurrent network", choices=("ncs", "pbns", "snug"))
     descriptor: str = _f("heading_free", "pose descriptor", choices=("heading_free", "six", "quaternion", "axis_angle"))
-    static: tuple[int, ...] = _f((64, 128, 256), "static encoder; snug has the last size", low=1, high=65536)
-    joint: tuple[int, ...] = _f((32, 32), "dynamic encoder, each joint by itself", low=1, high=65536)
-    dynamic: tuple[int, ...] = _f((256, 256), "dynamic encoder, all joints; snug's encoder", low=1, high=65536)
-    cell: str = _f("gated", "what ncs remembers by, see the README", choices=("gated", "linear", "swing"))
-    vibrations: int = _f(12, "the garment's vibrations that a swing is made of", low=1, high=256)
-    damping: float = _f(0.3, "of a swing, 1/s", low=0, high=1e6)
-    decoder: tuple[int, ...] = _f((256, 256, 256), "decoder", low=1, high=65536)
-    modes: int = _f(128, "smooth modes of the garment that the decoder moves; 0: none", low=0, high=4096)
+    static: tuple[int, ...] = _f((64, 128, 256), "layer sizes, static encoder; snug takes the last", low=1, high=65536)
+    joint: tuple[int, ...] = _f((32, 32), "layer sizes, dynamic encoder, each joint by itself", low=1, high=65536)
+    dynamic: tuple[int, ...] = _f((256, 256), "layer sizes, dynamic encoder, all joints; snug's encoder", low=1, high=65536)
+    cell: str = _f("gated", "recurrent cell of ncs, see the README", choices=("gated", "linear", "swing"))
+    vibrations: int = _f(12, "number of the garment's vibrations that a swing cell moves", low=1, high=256)
+    damping: float = _f(0.3, "damping of a swing cell, 1/s", low=0, high=1e6)
+    decoder: tuple[int, ...] = _f((256, 256, 256), "layer sizes, decoder", low=1, high=65536)
+    modes: int = _f(128, "smooth modes of the garment that the decoder also moves; 0: none", low=0, high=4096)
 
 
 @dataclass(frozen=True)
 class TrainingSpec:
-    """[training]."""
+    """[training]: the optimisation."""
 
     steps: int = _f(5000, "optimiser steps", low=1, high=10_000_000)
-    batch: int = _f(32, "windows a step", low=1, high=65536)
-    window: int = _f(11, "frames a window; inertia sees at least 3", low=1, high=10000)
+    batch: int = _f(32, "windows in a step", low=1, high=65536)
+    window: int = _f(11, "frames in a window; with inertia at least 3 are taken", low=1, high=10000)
     learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
-    motion_augmentation: float = _f(0.0, "share of a batch with another window's motion", low=0, high=1)
+    motion_augmentation: float = _f(0.0, "share of a batch that gets another window's motion", low=0, high=1)
     validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)
     checkpoint_every: int = _f(200, "steps between checkpoints", low=1, high=10_000_000)
-    seed: int = _f(0, "seed of all that is random", low=0, high=2**31 - 1)
+    seed: int = _f(0, "seed of all random numbers", low=0, high=2**31 - 1)
 
 
 @dataclass(frozen=True)
@@ -183,11 +183,11 @@ class SimulationSpec:
     """[simulation]: how `ncs simulate` solves a frame."""
 
     solver: str = _f("newton", "newton for accuracy, quasi_newton for speed", choices=("newton", "quasi_newton"))
-    tolerance: float = _f(0.1, "out-of-balance acceleration, g", low=1e-9, high=1e6)
+    tolerance: float = _f(0.1, "out-of-balance acceleration to stop at, g", low=1e-9, high=1e6)
     precision: str = _f("auto", "auto: double where single cannot reach the tolerance", choices=("auto", "single", "double"))
-    iterations: int = _f(100, "most iterations a step", low=1, high=1_000_000)
-    substeps: int = _f(1, "steps a frame", low=1, high=1000)
-    pins: str = _f("springs", "what holds the pins", choices=("springs", "exact"))
+    iterations: int = _f(100, "iterations in a step, at most", low=1, high=1_000_000)
+    substeps: int = _f(1, "time steps in a frame", low=1, high=1000)
+    pins: str = _f("springs", "how pins are held", choices=("springs", "exact"))
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class Scene:
     source: str = field(default="", metadata={"internal": True})
 
     def path(self, name: str) -> Path:
-        """Where a file named in this scene is."""
+        """Return the path of a file that this scene names."""
         if name.startswith("ncs:"):
             return packaged(name[4:])
         path = Path(name).expanduser()
@@ -212,15 +212,15 @@ class Scene:
 
     @property
     def motions(self) -> tuple[str, ...]:
-        """All motions by name, those to train on first."""
+        """Return the names of all motions, those to train on first."""
         return (*self.motion.files, *self.motion.validation)
 
     def without_network(self) -> Scene:
-        """The same with nothing that only a network needs, for a simulation or an animation that is there already."""
+        """Return the scene without what only a network needs, for a simulation or for an animation that exists already."""
         return dataclasses.replace(self, network=dataclasses.replace(self.network, method="pbns", modes=0))
 
     def to_dict(self) -> dict:
-        """Plain tables, as in the file, with files as absolute paths, so that the scene can be rebuilt anywhere."""
+        """Return plain tables, as in the file, with absolute paths, so that the scene can be rebuilt from any folder."""
         tables = dataclasses.asdict(self)
         del tables["source"]
 
@@ -248,15 +248,15 @@ PRESETS: dict[str, dict] = {
         "network": {"static": (64, 128, 256), "dynamic": (256, 256), "decoder": (256, 256, 256), "modes": 128},
         "training": {"steps": 15000},
     },
-}  # what `ncs train --preset` puts in place of a scene's own values; experiments/speed_accuracy.py measures them
+}  # values that `ncs train --preset` puts in place of a scene's own; experiments/speed_accuracy.py measures them
 
 
 def packaged(name: str, suffix: str = ".npz") -> Path:
-    """A file that comes with the package."""
+    """Return the path of a file that comes with the package."""
     path = ASSETS / f"{name}{suffix}"
     if not path.is_file():
-        known = ", ".join(sorted(f"ncs:{p.stem}" for p in ASSETS.glob(f"*{suffix}")))
-        raise InputError("no such packaged file", field=f"ncs:{name}", mend=f"use one of {known}")
+        names = ", ".join(sorted(f"ncs:{p.stem}" for p in ASSETS.glob(f"*{suffix}")))
+        raise InputError("no such packaged file", field=f"ncs:{name}", mend=f"use one of {names}")
     return path
 
 
@@ -264,7 +264,7 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     """Read and check a scene file; `ncs:NAME` names a packaged scene.
 
     Args:
-        path: the file. preset: one of PRESETS, whose values take the place of the scene's own.
+        path: the file. preset: one of PRESETS, whose values replace the scene's own.
 
     Raises:
         InputError: the file is missing or not TOML, a key is unknown, or a value has the wrong type or is out of its range.
@@ -278,7 +278,7 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", file=file, mend="mend that line") from None
+        raise InputError(f"not TOML: {error}", file=file, mend="correct that line") from None
     for table, values in PRESETS[preset].items() if preset else ():
         if isinstance(own := tables.get(table, {}), dict):
             tables[table] = {**own, **values}
@@ -286,7 +286,7 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
 
 
 def scene_from(tables: dict, source: str = "") -> Scene:
-    """A scene from plain tables, checked like a file."""
+    """Return a scene from plain tables, which are checked like a file."""
     scene = _parse(Scene, tables, source or "scene", "")
     gravity = scene.physics.gravity
     if len(gravity) != 3:
@@ -304,12 +304,12 @@ def scene_from(tables: dict, source: str = "") -> Scene:
 
 
 def template() -> str:
-    """A whole scene file: every field with its default, and in a comment what it is and what it may be."""
+    """Return a whole scene file: every field with its default, and in a comment its meaning and its range."""
     return "\n".join(_tables(Scene(), "")).strip() + "\n"
 
 
 def _tables(spec, where: str) -> Iterator[str]:
-    """The lines of a table's own fields, then of the tables in it."""
+    """Yield the lines of a table's own fields, then those of the tables in it."""
     fields = [f for f in dataclasses.fields(spec) if not f.metadata.get("internal")]
     nested = [f for f in fields if dataclasses.is_dataclass(getattr(spec, f.name))]
     if where:
@@ -329,6 +329,7 @@ def _tables(spec, where: str) -> Iterator[str]:
 
 
 def _parse(cls, tables, source: str, where: str):
+    """Return a dataclass from a table: every key must be a field, every value of its type and in its range."""
     if not isinstance(tables, dict):
         raise InputError("a table expected", file=source, field=where, value=tables, mend=f"write [{where}] and its fields")
     hints = typing.get_type_hints(cls)
@@ -341,7 +342,7 @@ def _parse(cls, tables, source: str, where: str):
                 file=source,
                 field=f"{where}.{key}".lstrip("."),
                 value=tables[key],
-                mend=f"did you mean {near}?" if near else f"known here: {', '.join(fields)}",
+                mend=f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}",
             )
     values = {}
     for name, f in fields.items():
@@ -351,6 +352,7 @@ def _parse(cls, tables, source: str, where: str):
 
 
 def _value(kind, value, meta, source, where):
+    """Return a value as the type of its field, after a check of type, choices and range."""
     if dataclasses.is_dataclass(kind):
         return _parse(kind, value, source, where)
     origin = typing.get_origin(kind)
@@ -391,6 +393,7 @@ def _value(kind, value, meta, source, where):
 
 
 def _nearest(key: str, names) -> str:
+    """Return the name that is most like a key, empty where none is."""
     import difflib
 
     return next(iter(difflib.get_close_matches(key, list(names), n=1)), "")

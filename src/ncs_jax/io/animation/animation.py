@@ -36,21 +36,21 @@ def write_animation(
     rest: ArrayLike | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | None = None,
 ) -> None:
-    """Write a moving mesh; the suffix says how, and the file or folder appears whole or not at all.
+    """Write a moving mesh in the format of the suffix; the file or folder appears whole or not at all.
 
     .npz and .h5 hold `vertices` (T, V, 3) float32, `faces` (F, 3) int32 and `fps`. .pc2 and .mdd hold the vertices only, in the
-    order in which they are given, which is the garment file's: they go onto the mesh of that file. .glb plays in viewers, see
-    `write_glb`; .usd, .usdc, .usda and .usdz hold the rest shape too, see `write_usd`. A path without a suffix, or one that
-    ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces such a folder and no other.
+    given order, which is the garment file's: they can be put onto the mesh of that file. .glb plays in viewers, see
+    `write_glb`. .usd, .usdc, .usda and .usdz hold the rest shape too, see `write_usd`. A path without a suffix, or one that
+    ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces only a folder of such files.
 
     Args:
-        path: where to. Missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
-        rest: (V, 3) m, the shape at rest, for USD; else that of the first frame. worn_by: the body and its motion of T frames,
-            to go into a .glb too.
+        path: the file to write; missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
+        rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. worn_by: the body and its motion of T frames,
+            to be written into a .glb too.
 
     Raises:
-        InputError: the suffix is unknown, or holds no body, the arrays do not fit together or are not finite, or the place
-            cannot be written to.
+        InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
+            file cannot be written.
     """
     file = Path(path)
     suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
@@ -104,10 +104,10 @@ def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: floa
 
 
 def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: float | int | None = None) -> AnimationRecord:
-    """A moving mesh from .npz, .h5, .pc2, .mdd or USD.
+    """Read a moving mesh from .npz, .h5, .pc2, .mdd or USD.
 
     Args:
-        path: the file. faces, fps: of a .pc2, which holds neither, and faces of an .mdd; without them there are no faces and
+        path: the file. faces, fps: for a .pc2, which holds neither, and faces for an .mdd; without them there are no faces, and
             fps is NaN.
 
     Raises:

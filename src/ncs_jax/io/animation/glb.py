@@ -1,4 +1,4 @@
-"""Animations as binary glTF 2.0 (.glb): a morph target for each frame, and beside it, if wanted, the body with its skeleton."""
+"""Animations as binary glTF 2.0 (.glb): a morph target for each frame, and if wanted the body with its skeleton."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ncs_jax.io.tables.files import replacing
 
 __all__ = ["write_glb"]
 
-FLOAT, SHORT, INT = 5126, 5123, 5125  # numbers of glTF for types of numbers
-VERTICES, INDICES = 34962, 34963  # and for what a part of the file is for
+FLOAT, SHORT, INT = 5126, 5123, 5125  # glTF's codes for types of numbers
+VERTICES, INDICES = 34962, 34963  # glTF's codes for the use of a buffer view
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LARGEST = 2**32 - 1  # bytes that the header can count
-DESCRIPTION = 1000  # bytes; what the text says of a frame or a joint is less
+DESCRIPTION = 1000  # bytes; the JSON of a frame or a joint takes less
 MOST = 8  # joints that move a vertex, as in the package's own skinning
 CLOTH, SKIN = (0.32, 0.47, 0.65, 1.0), (0.78, 0.74, 0.7, 1.0)
 
@@ -35,20 +35,20 @@ def write_glb(
 ) -> None:
     """Write a moving mesh that plays in any viewer of glTF; the file appears whole or not at all.
 
-    The mesh stands as in the first frame. Target k takes it to frame k, with its normals, in float32; at the time of frame k
-    the weight of target k is 1 and every other is 0, linear between (sampler LINEAR), so that between two frames the vertices
-    move in straight lines. A frame takes 24 bytes a vertex, and the weights 4 bytes times the frames squared: 32 MB and 0.4 MB
-    for 300 frames of 4,500 vertices. What a viewer adds up is a frame to rounding of float32.
+    The mesh stands as in the first frame. Morph target k takes it to frame k, with its normals, in float32. At the time of
+    frame k the weight of target k is 1 and every other is 0, linear between (sampler LINEAR), so that vertices move in straight
+    lines between two frames. A frame takes 24 bytes a vertex, and the weights take 4 bytes times the frames squared: 32 MB and
+    0.4 MB for 300 frames of 4,500 vertices. The sum that a viewer makes equals the frame to rounding of float32.
 
-    A body is a skinned mesh on joints that the same animation turns; the 8 largest weights of a vertex are kept, in order, as
-    some viewers know only the first 4.
+    A body is a skinned mesh on joints that the same animation turns. The 8 largest weights of a vertex are kept, the largest
+    first, because some viewers know only the first 4.
 
     Args:
-        path: where to. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
+        path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
         worn_by: the body and its motion of T frames.
 
     Raises:
-        InputError: it takes more than 4 GiB, which the format cannot count, or the place cannot be written to.
+        InputError: the file would be larger than 4 GiB, which the format cannot count, or it cannot be written.
     """
     frames, count = vertices.shape[:2]
     size = 24 * frames * count + 4 * frames * frames + 4 * faces.size + DESCRIPTION * frames
@@ -78,7 +78,7 @@ def write_glb(
 
 
 class _Document:
-    """The text of a file as it grows, and what its one buffer is to hold, block by block."""
+    """The JSON of a file as it grows, and the blocks that its one buffer is to hold."""
 
     def __init__(self) -> None:
         self.nodes: list[dict] = []
@@ -93,30 +93,31 @@ class _Document:
         self.length = 0
 
     def view(self, length: int, arrays: Callable[[], Iterable[np.ndarray]], **more: int) -> int:
-        """A block of the buffer, which begins at a multiple of 4."""
+        """Add a block to the buffer, at a multiple of 4 bytes; return its number."""
         self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": length, **more})
         self.blocks.append((length, arrays))
         self.length += length + -length % 4
         return len(self.views) - 1
 
     def accessor(self, view: int, offset: int, kind: int, count: int, shape: str, ends: np.ndarray | None = None) -> int:
+        """Add an accessor of a block; return its number. `ends` are its least and largest values."""
         given = {"bufferView": view, "byteOffset": offset, "componentType": kind, "count": count, "type": shape}
         self.accessors.append(given if ends is None else given | {"min": ends[0].tolist(), "max": ends[1].tolist()})
         return len(self.accessors) - 1
 
     def array(self, rows: np.ndarray, *, bounded: bool = False, **more: int) -> int:
-        """An accessor of rows (N, components) in a block of their own."""
+        """Add an accessor of rows (N, components) in a block of their own; return its number."""
         kind = {"f4": FLOAT, "u2": SHORT, "u4": INT}[rows.dtype.str[1:]]
         view = self.view(rows.nbytes, lambda: [rows], **more)
         ends = np.stack([rows.min(axis=0), rows.max(axis=0)]) if bounded else None
         return self.accessor(view, 0, kind, len(rows), SHAPES[rows.shape[1]], ends)
 
     def corners(self, faces: np.ndarray, count: int) -> int:
-        """An accessor of the corners of faces among so many vertices."""
+        """Add an accessor of the corners of faces among `count` vertices; return its number."""
         return self.array(faces.astype("<u2" if count < 2**16 else "<u4").reshape(-1, 1), target=INDICES)
 
     def mesh(self, name: str, primitive: dict, color: tuple[float, ...], **more) -> dict:
-        """A mesh of one primitive and the node that it is at, which is a root."""
+        """Add a mesh of one primitive, and a root node that it hangs on; return the mesh."""
         metal = {"baseColorFactor": color, "metallicFactor": 0, "roughnessFactor": 0.9}
         self.materials.append({"name": name, "doubleSided": True, "pbrMetallicRoughness": metal})
         mesh = {"name": name, "primitives": [primitive | {"mode": 4, "material": len(self.materials) - 1}]}
@@ -126,11 +127,12 @@ class _Document:
         return mesh
 
     def moved(self, node: int, path: str, keys: int, values: int) -> None:
-        """Let a node's property go linearly through values."""
+        """Add a channel that moves a node's property linearly through values."""
         self.animation["channels"].append({"sampler": len(self.animation["samplers"]), "target": {"node": node, "path": path}})
         self.animation["samplers"].append({"input": keys, "output": values, "interpolation": "LINEAR"})
 
     def finished(self) -> dict:
+        """Return the whole JSON; lists that stayed empty are left out."""
         own = {
             "nodes": self.nodes,
             "meshes": self.meshes,
@@ -146,6 +148,7 @@ class _Document:
 
 
 def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, keys: int | None) -> None:
+    """Add the garment: its mesh, a morph target for each later frame, and their weights over time."""
     frames, count = vertices.shape[:2]
 
     def shapes() -> Iterator[np.ndarray]:
@@ -181,12 +184,12 @@ def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, keys:
 
 
 def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int | None) -> None:
-    """Joints whose axes are the world's at rest, so that their local rotations are those of the package's kinematics."""
+    """Add the body: its skin, joints and their movement. The joints' axes are the world's at rest, as in `skinning.forward`."""
     count, joints = body.weights.shape
     poses = motion.poses if body.rest_rotations is None else np.einsum("jab,tjb->tja", body.rest_rotations, motion.poses)
     turns = np.roll(from_axis_angle(poses), -1, axis=-1).astype("<f4")  # x y z w
     bones = body.joints - np.where(body.parents[:, None] >= 0, body.joints[body.parents], 0)
-    ways = (bones[0] + motion.translation).astype("<f4")
+    path = (bones[0] + motion.translation).astype("<f4")
 
     order = np.argsort(-body.weights, axis=1, kind="stable")[:, :MOST]
     shares = np.take_along_axis(body.weights, order, axis=1)
@@ -213,11 +216,11 @@ def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int
     document.roots.append(first)
     for j in range(joints):
         name = body.joint_names[j] if body.joint_names else f"joint_{j}"
-        place = ways[0] if j == 0 else bones[j]
+        place = path[0] if j == 0 else bones[j]
         node = {"name": name, "translation": place.tolist(), "rotation": turns[0, j].tolist()}
         below = (first + np.flatnonzero(body.parents == j)).tolist()
         document.nodes.append(node | ({"children": below} if below else {}))
         if keys is not None and np.ptp(turns[:, j], axis=0).any():
             document.moved(first + j, "rotation", keys, document.array(turns[:, j]))
-    if keys is not None and np.ptp(ways, axis=0).any():
-        document.moved(first, "translation", keys, document.array(ways))
+    if keys is not None and np.ptp(path, axis=0).any():
+        document.moved(first, "translation", keys, document.array(path))

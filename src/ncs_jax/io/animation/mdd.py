@@ -16,7 +16,7 @@ HEADER = struct.Struct(">ii")  # frames, points; then a time of each frame in s,
 
 
 def read_mdd(path: str | Path) -> tuple[Path, np.ndarray, float]:
-    """The file, positions (T, V, 3) float32, unchecked but for their number, and frames per second; NaN for a single frame."""
+    """Read an .mdd: the file, positions (T, V, 3) float32, not checked, and frames per second, NaN for a single frame."""
     file = readable(path)
     size = file.stat().st_size
     with reading(file, ".mdd"), file.open("rb") as stream:
@@ -35,7 +35,7 @@ def read_mdd(path: str | Path) -> tuple[Path, np.ndarray, float]:
             "times that rise in even steps expected", file=file, field="times", value=times[:4].tolist(),
             mend="export it again, every frame once",
         )  # fmt: skip
-    return file, x, float(f"{1 / step:.6g}")  # of times in float32
+    return file, x, float(f"{1 / step:.6g}")  # the times are in float32
 
 
 def write_mdd(path: str | Path, vertices: np.ndarray, fps: float) -> None:

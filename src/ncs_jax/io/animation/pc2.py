@@ -17,7 +17,7 @@ NAME = b"POINTCACHE2\0"
 
 
 def read_pc2(path: str | Path) -> tuple[Path, np.ndarray]:
-    """The file and positions (T, V, 3) float32, unchecked but for their number."""
+    """Read a .pc2: the file and positions (T, V, 3) float32, not checked."""
     file = readable(path)
     size = file.stat().st_size
     with reading(file, ".pc2"), file.open("rb") as stream:

@@ -30,17 +30,17 @@ np.savez({new!r}, **{{k: np.array(m[k].toarray() if hasattr(m[k], 'toarray') els
 
 
 def read_body(path: str | Path) -> BodyRecord:
-    """A character in its rest pose, from .npz, .glb, .gltf or .fbx.
+    """Read a character in its rest pose, from .npz, .glb, .gltf or .fbx.
 
-    Of .glb, .gltf and .fbx, see `gltf_body` and `fbx_body`. An .npz holds `vertices` (V, 3) and `joints` (J, 3) in m, `faces`
-    (F, 3), `parents` (J,), and skinning weights either dense, `blend_weights` (V, J), or sparse, `weight_joints` (V, K) with
-    `weights` (V, K). `joint_names` (J,) and `rest_rotations` (J, 3, 3) may be there. The root's parent is -1, or as SMPL files
-    have it 0 or 4294967295. Rows of weights that sum to 1 within 1e-3 are divided by their sum.
+    For .glb, .gltf and .fbx, see `gltf_body` and `fbx_body`. An .npz holds `vertices` (V, 3) and `joints` (J, 3) in m, `faces`
+    (F, 3), `parents` (J,), and skinning weights, either dense, `blend_weights` (V, J), or sparse, `weight_joints` (V, K) with
+    `weights` (V, K). It may hold `joint_names` (J,) and `rest_rotations` (J, 3, 3). The root's parent is -1; SMPL files write 0
+    or 4294967295. Rows of weights must sum to 1 within 1e-3, and are divided by their sum.
 
-    A model file of SMPL, SMPL-H or SMPL-X is read as it is distributed, `v_template` (V, 3), `f` (F, 3), `weights` (V, J),
-    `kintree_table` (2, J) and `J_regressor`, (J, V) or the three arrays of a sparse one with `_data`, `_indices` and `_indptr`
-    after its name: the mean shape, its joints J_regressor v_template. Shape and pose correctives are not applied. A .pkl runs
-    whatever code is in it, so it is refused with the command that makes a .npz of it.
+    A model file of SMPL, SMPL-H or SMPL-X is read as it is distributed: `v_template` (V, 3), `f` (F, 3), `weights` (V, J),
+    `kintree_table` (2, J) and `J_regressor` (J, V), or instead of the last the three arrays of a sparse matrix, with `_data`,
+    `_indices` and `_indptr` after its name. The body has the mean shape, and its joints are J_regressor v_template. Shape and
+    pose correctives are not applied. A .pkl may run any code, so it is refused; the message has a command that makes an .npz.
 
     Raises:
         InputError: the file cannot be read; or shapes disagree, a number is not finite or names nothing, the joints are not one
@@ -53,7 +53,7 @@ def read_body(path: str | Path) -> BodyRecord:
         convert = CONVERT.format(old=str(path), new=str(Path(path).with_suffix(".npz")), fields=MODEL)
         raise InputError(
             "an .npz expected: a pickle may run any code, so none is ever loaded", file=path, value=suffix,
-            mend=f"where you trust it, make one (a few of these files need `pip install chumpy` for it): {convert}",
+            mend=f"if you trust the file, make one (some of these files need `pip install chumpy`): {convert}",
         )  # fmt: skip
     table = read_npz(path, {*FIELDS, *MODEL, *SPARSE}.__contains__)
     if "v_template" in table:
@@ -79,7 +79,7 @@ def read_body(path: str | Path) -> BodyRecord:
 
 
 def _model(table: Table) -> Table:
-    """A model file of the SMPL family in this package's layout."""
+    """Return a model file of the SMPL family in this package's layout."""
     vertices = table.floats("v_template", ("V", 3), ("vertex",))
     kintree = table.array("kintree_table")
     if kintree.ndim != 2 or len(kintree) != 2:
@@ -100,7 +100,7 @@ def _model(table: Table) -> Table:
 
 
 def _sparse_rows(table: Table, joints: int, vertices: int) -> np.ndarray:
-    """The regressor (joints, vertices) from its parts, compressed by joint (CSR) or by vertex (CSC), as their lengths tell."""
+    """Return the regressor (joints, vertices) from its parts, compressed by joint (CSR) or vertex (CSC): their lengths tell."""
     data = table.floats(SPARSE[0], ("N",))
     pointer = indices(table.file, SPARSE[2], table.array(SPARSE[2]), ("P",), len(data) + 1, "entries")
     by_joint = len(pointer) == joints + 1
@@ -122,6 +122,7 @@ def _sparse_rows(table: Table, joints: int, vertices: int) -> np.ndarray:
 
 
 def _weights(table: Table, vertices: int, joints: int) -> np.ndarray:
+    """Return skinning weights (vertices, joints) from the dense or the sparse arrays."""
     field = "blend_weights" if "blend_weights" in table or "weight_joints" not in table else "weights"
     if field == "blend_weights":
         table.first("blend_weights", "weight_joints and weights")
@@ -139,6 +140,7 @@ def _weights(table: Table, vertices: int, joints: int) -> np.ndarray:
 
 
 def _rest_rotations(table: Table, joints: int) -> np.ndarray | None:
+    """Return the joints' rotations in the rest pose (joints, 3, 3), None where the file has none."""
     if "rest_rotations" not in table:
         return None
     turns = table.floats("rest_rotations", (joints, 3, 3), ("joint",))

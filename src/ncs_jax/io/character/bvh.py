@@ -23,10 +23,10 @@ class Bvh:
     """A skeleton and its motion, lengths in the file's own unit.
 
     Attributes:
-        file: where it is from. joint_names: J names, root first; end sites are no joints. parents: (J,) int32, -1 for the root.
-        offsets: (J, 3) of each joint from its parent in the rest pose; the root's own is where it rests. tips: (J, 3) of an end
-            site from its joint; NaN where a joint has none. poses: (T, J, 3) local rotations since rest, axis times angle.
-            positions: (T, 3) of the root. fps: frames per second.
+        file: the path. joint_names: J names, root first; end sites are no joints. parents: (J,) int32, -1 for the root.
+        offsets: (J, 3) from each joint's parent to the joint in the rest pose; the root's is its rest place.
+        tips: (J, 3) from a joint to its end site; NaN where a joint has none. poses: (T, J, 3) local rotations since rest, axis
+            times angle. positions: (T, 3) of the root. fps: frames per second.
     """
 
     file: Path
@@ -42,7 +42,7 @@ class Bvh:
 def read_bvh(path: str | Path) -> Bvh:
     """Read a skeleton with its motion. Channels may stand in any order: R = R_first R_second R_third.
 
-    A rotation or position that is not a finite number stays NaN, for the caller who may not want that frame.
+    A number that is not finite stays so: the caller checks the frames that it uses.
     """
     file, text = text_of(path)
     parts = re.split(r"^\s*MOTION\s*$", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
@@ -67,13 +67,14 @@ def read_bvh(path: str | Path) -> Bvh:
                     raise InputError(
                         "bones of fixed length expected", file=file, field=f"joint {names[j]}",
                         value=f"its {'XYZ'[axis]}position varies by {np.ptp(value):.3g}",
-                        mend="export rotations only, but for the root",
+                        mend="export positions for the root only",
                     )  # fmt: skip
             poses[:, j] = to_axis_angle(turn)
     return Bvh(file, tuple(names), np.array(parents, np.int32), offsets, tips, poses, positions, fps)
 
 
 def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray, np.ndarray, list[list[tuple[str, int]]]]:
+    """Return names, parents, offsets, tips and channels of the joints."""
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
@@ -91,7 +92,9 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
                     "one ROOT, and each JOINT inside another, expected", file=file, field=where, value=f"{word} {name}"
                 )
             if not name or name in names:
-                raise InputError("a name for each joint expected", file=file, field=where, value=name, mend="rename one")
+                raise InputError(
+                    "a different name for each joint expected", file=file, field=where, value=name, mend="rename one"
+                )
             parents.append(open_joints[-1] if open_joints else -1)
             open_joints.append(len(names))
             names.append(name)
@@ -121,22 +124,27 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
             )  # fmt: skip
         if names and not open_joints and key == "}":
             break
+    _check_whole(file, names, offsets, len(open_joints), words)
+    return names, parents, np.array(offsets), np.array(tips), channels
+
+
+def _check_whole(file: Path, names: list[str], offsets: list[list[float]], unclosed: int, words: Iterator) -> None:
+    """Raise an InputError unless a skeleton has a root, closed braces and all offsets, and no more words follow."""
     bare = next((n for n, o in zip(names, offsets, strict=True) if not o), None)
-    if not names or open_joints or bare is not None:
+    if not names or unclosed or bare is not None:
         raise InputError(
             "a ROOT with all its braces closed, and an OFFSET for each joint, expected", file=file, field="HIERARCHY",
-            value=bare or f"{len(names)} joints, {len(open_joints)} not closed", mend="export the .bvh again",
+            value=bare or f"{len(names)} joints, {unclosed} not closed", mend="export the .bvh again",
         )  # fmt: skip
     left = next(words, (0, ""))
     if left[1]:
         raise InputError(
             "one skeleton expected", file=file, field=f"line {left[0]}", value=left[1], mend="export one character"
         )
-    return names, parents, np.array(offsets), np.array(tips), channels
 
 
 def _words(file: Path, text: str) -> Iterator[tuple[int, str]]:
-    """Line number and word, and at the end the empty word, which nothing accepts."""
+    """Yield line number and word of all words, and at the end an empty word, which nothing accepts."""
     line = 0
     for line, content in enumerate(text.splitlines(), 1):
         for word in content.replace("{", " { ").replace("}", " } ").split():
@@ -145,6 +153,7 @@ def _words(file: Path, text: str) -> Iterator[tuple[int, str]]:
 
 
 def _until_brace(words: Iterator[tuple[int, str]]) -> list[str]:
+    """Return the words before the next opening brace, or before the end."""
     found = []
     for _, word in words:
         if word in ("{", ""):

@@ -25,7 +25,7 @@ ARRAYS = {b"f": "<f4", b"d": "<f8", b"l": "<i8", b"i": "<i4", b"b": "<i1", b"c":
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """An array as it stands in the file: `count` numbers in bytes, deflated or not, or in text."""
+    """An array as it is in the file: `count` numbers in bytes, deflated or not, or in text."""
 
     count: int
     dtype: str
@@ -42,33 +42,33 @@ class Record:
     inner: list[Record]
 
     def all(self, name: str) -> Iterator[Record]:
-        """The records of a name in this one."""
+        """Return the records in this one that have a name."""
         return (r for r in self.inner if r.name == name)
 
     def first(self, name: str) -> Record:
-        """The first record of a name in this one; an empty one where there is none."""
+        """Return the first record in this one that has a name; an empty record where there is none."""
         return next(self.all(name), Record(name, [], []))
 
     def value(self, index: int, kinds: type | tuple[type, ...], default):
-        """A value of a kind; the default where there is none of that kind."""
+        """Return a value if it has one of these types, else the default."""
         found = self.values[index] if index < len(self.values) else default
         return found if isinstance(found, kinds) and not isinstance(found, bool) else default
 
 
 @dataclass(eq=False)
 class Fbx:
-    """A file's records under one root, and how many bytes of arrays were taken out of them, which must fit into LARGEST."""
+    """A file's records under one root. `taken` counts the bytes of all arrays read so far, at most LARGEST."""
 
     file: Path
     root: Record
     taken: int = field(default=0)
 
     def wrong(self, expected: str, where: str, value: object = None, mend: str = "export the file again") -> InputError:
-        """The error to raise about something in this file."""
+        """Return the error to raise about something in this file."""
         return InputError(expected, file=self.file, field=where, value=value, mend=mend)
 
     def array(self, owner: Record, name: str, where: str, whole: bool = False) -> np.ndarray:
-        """The numbers of a record in another: int64, or finite float64. Empty where it is not there."""
+        """Return the numbers of a record in another, int64 or finite float64; none where it is not there."""
         packed = owner.first(name).value(0, Packed, Packed(0, "<f8", b"", False))
         label = f"{where} {name}"
         size = packed.count * 8
@@ -117,12 +117,14 @@ class _Binary:
         self.file, self.data, self.left = file, data, MOST
 
     def cut(self, place: int) -> InputError:
+        """Return the error to raise where a record does not end as it says."""
         return InputError(
             "whole records expected", file=self.file, field=f"byte {place}", value=f"{len(self.data)} bytes in all",
             mend="the file is cut short or damaged; export it again",
         )  # fmt: skip
 
     def root(self) -> tuple[Record, int]:
+        """Return all records under one, and the version."""
         if len(self.data) < 27:
             raise self.cut(len(self.data))
         version = struct.unpack_from("<I", self.data, 23)[0]
@@ -130,7 +132,7 @@ class _Binary:
         return Record("", [], self.records(27, len(self.data), 0)), version
 
     def records(self, place: int, end: int, depth: int) -> list[Record]:
-        """The records from a place up to an empty one, or to the end."""
+        """Return the records from a place up to an empty one, or to the end."""
         found, size = [], struct.calcsize(self.head)
         while place + size <= end:
             stop, count, length, letters = struct.unpack_from(self.head, self.data, place)
@@ -147,6 +149,7 @@ class _Binary:
         return found
 
     def values(self, place: int, end: int, count: int) -> list:
+        """Return the values of a record: numbers, text, bytes or packed arrays."""
         found: list = []
         for _ in range(count):
             kind, place = self.data[place : place + 1], place + 1
@@ -184,6 +187,7 @@ class _Text:
         self.file, self.text = file, text
 
     def wrong(self, place: int) -> InputError:
+        """Return the error to raise about the text at a place."""
         line = self.text.count("\n", 0, place) + 1
         return InputError(
             "the records of an FBX expected", file=self.file, field=f"line {line}", value=self.text[place : place + 20],
@@ -191,6 +195,7 @@ class _Text:
         )  # fmt: skip
 
     def root(self) -> Record:
+        """Return all records under one."""
         place, left = 0, 10 * MOST
         open_records = [Record("", [], [])]
         last = open_records[0]
@@ -223,6 +228,7 @@ class _Text:
         return open_records[0]
 
     def number(self, word: str, place: int) -> int | float:
+        """Return the number that a word means."""
         try:
             return int(word) if re.fullmatch(r"[-+]?\d{1,20}", word) else float(word)
         except ValueError:

@@ -29,25 +29,25 @@ NUMBERS = (int, float)
 
 @dataclass(frozen=True, eq=False)
 class FbxModel:
-    """A node: its properties with those of the file's template below them."""
+    """A node. Its properties come from the node itself, else from the file's template."""
 
     key: int
     name: str
     properties: dict[str, list]
 
     def vector(self, name: str, default: float = 0.0) -> np.ndarray:
-        """Three numbers of a property."""
+        """Return the three numbers of a property, each the default where the property is not there."""
         found = self.properties.get(name, [])[:3]
         return np.array(found, np.float64) if len(found) == 3 else np.full(3, default)
 
     def number(self, name: str) -> int:
-        """A whole number of a property, 0 where it is not there."""
+        """Return the whole number of a property, 0 where it is not there."""
         return int(next(iter(self.properties.get(name, [])), 0))
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """All models, parents before children, and what hangs on what: `below[key]` lists (object, property) under an object.
+    """All models, parents before children, and the connections: `below[key]` lists (object, property) under an object.
 
     `to_metres` (4, 4) leads from the file's axes and unit to metres and Y up. `fps`: frames per second.
     """
@@ -61,16 +61,16 @@ class Graph:
     fps: float
 
     def under(self, key: int, name: str, kind: str = "") -> list[tuple[int, Record, str]]:
-        """The objects of a name, and of a kind, under one: (key, record, property)."""
+        """Return the objects under one that have a name and, if given, a kind: (key, record, property)."""
         found = [(k, self.objects[k], p) for k, p in self.below.get(key, ()) if k in self.objects]
         return [(k, r, p) for k, r, p in found if r.name == name and kind in ("", r.value(2, str, ""))]
 
 
 def fbx_body(path: str | Path) -> BodyRecord:
-    """The skinned character of an .fbx in the pose in which it was bound, m, Y up: see `rig_from`.
+    """Read the skinned character of an .fbx in the pose in which it was bound, m, Y up: see `rig_from`.
 
-    Units and axes are those that the file states. All skinned meshes are joined; polygons become triangles; meshes without a
-    skin, shapes and materials are passed over.
+    Units and axes are those that the file states. All skinned meshes are joined, and polygons become triangles. Meshes without
+    a skin, shapes and materials are ignored.
     """
     with reading(Path(path), "FBX"):
         graph = _graph(read_fbx(path))
@@ -81,10 +81,10 @@ def fbx_body(path: str | Path) -> BodyRecord:
 
 
 def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """An animation of an .fbx since the pose of `fbx_body`, at the file's frame rate; the first, or that of a name.
+    """Read an animation of an .fbx since the pose of `fbx_body`, at the file's frame rate; the first, or the named one.
 
-    Joints without curves keep their model's place. Of a file without a skin (Mixamo's "Without Skin"), the models' own pose is
-    at rest.
+    Joints without curves keep their model's place. In a file without a skin (Mixamo's "Without Skin"), the rest pose is the one
+    in which the models stand.
     """
     with reading(Path(path), "FBX"):
         graph = _graph(read_fbx(path))
@@ -99,6 +99,7 @@ def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
 
 
 def _graph(fbx: Fbx) -> Graph:
+    """Return the models of a file, sorted by depth, with what is connected to them."""
     objects = {r.value(0, int, 0): r for r in fbx.root.first("Objects").inner}
     below: dict[int, list[tuple[int, str]]] = {}
     for line in fbx.root.first("Connections").all("C"):
@@ -132,19 +133,19 @@ def _graph(fbx: Fbx) -> Graph:
 
 
 def _name(record: Record) -> str:
-    """`Hips` of a binary file's `Hips\\0\\1Model` and of a text file's `Model::Hips`."""
+    """Return the name of an object: `Hips` for a binary file's `Hips\\0\\1Model` and for a text file's `Model::Hips`."""
     name = record.value(1, str, "").split("\0", 1)[0]
     return name.split("::", 1)[1] if name.startswith(("Model::", "AnimStack::")) else name
 
 
 def _properties(record: Record) -> dict[str, list]:
-    """The numbers of each property in a record's Properties70."""
+    """Return the numbers of each property in a record's Properties70."""
     lines = record.first("Properties70").all("P")
     return {line.value(0, str, ""): [v for v in line.values[4:] if isinstance(v, NUMBERS) and abs(v) < 1e30] for line in lines}
 
 
 def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
-    """(4, 4) from the file's axes and unit to metres and Y up, and the frames per second."""
+    """Return the matrix (4, 4) from the file's axes and unit to metres and Y up, and the frames per second."""
     given = _properties(fbx.root.first("GlobalSettings"))
 
     def number(name: str, default: float) -> float:
@@ -167,7 +168,7 @@ def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
 
 
 def _euler(degrees: np.ndarray, order: str = "XYZ") -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of angles about X, Y and Z (..., 3)."""
+    """Return rotation matrices (..., 3, 3) of angles about X, Y and Z (..., 3), degrees."""
     turn = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*degrees.shape[:-1], 4))
     for axis in order:
         i = "XYZ".index(axis)
@@ -176,7 +177,7 @@ def _euler(degrees: np.ndarray, order: str = "XYZ") -> np.ndarray:
 
 
 def _local(model: FbxModel, moved: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Translation (..., 3), rotation (..., 3, 3) and scale (..., 3) of a model, with its pivots.
+    """Return translation (..., 3), rotation (..., 3, 3) and scale (..., 3) of a model, with its pivots.
 
     M = T Roff Rp Rpre R Rpost^-1 Rp^-1 Soff Sp S Sp^-1.
     """
@@ -196,8 +197,10 @@ def _local(model: FbxModel, moved: dict[str, np.ndarray]) -> tuple[np.ndarray, n
 def _worlds(
     graph: Graph, wanted: Sequence[int] = (), curves: dict | None = None, times: np.ndarray | None = None
 ) -> np.ndarray:
-    """Model to world, (N, 4, 4) of all as they stand, or (times, n, 4, 4) of those wanted. Scales are inherited as
-    InheritType says: 0 after the model's own rotation, 1 before it, 2 without the parent's own."""
+    """Return model to world: (N, 4, 4) of all models as they stand, or (times, n, 4, 4) of those wanted.
+
+    Scales are inherited as InheritType says: 0 after the model's own rotation, 1 before it, 2 without the parent's own.
+    """
     count = () if times is None else (len(times),)
     needed = set(range(len(graph.models)) if times is None else ())
     for node in wanted:
@@ -232,6 +235,7 @@ def _worlds(
 
 
 def _moved(model: FbxModel, number: int, curves: dict, times: np.ndarray) -> dict[str, np.ndarray]:
+    """Return those of a model's translation, rotation and scaling (times, 3) that curves move."""
     found = {}
     for name, usual in (("Lcl Translation", 0.0), ("Lcl Rotation", 0.0), ("Lcl Scaling", 1.0)):
         own = [curves.get((number, name, axis)) for axis in range(3)]
@@ -243,7 +247,7 @@ def _moved(model: FbxModel, number: int, curves: dict, times: np.ndarray) -> dic
 
 
 def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, str, int], Curve]]:
-    """Begin and end of an animation, s, and its curves by (model, property, axis)."""
+    """Return begin and end of an animation, s, and its curves by (model, property, axis)."""
     stacks = [(k, r) for k, r in graph.objects.items() if r.name == "AnimationStack"]
     names = [_name(r) for _, r in stacks]
     key, stack = stacks[clip_named(graph.fbx.file, names, name)]
@@ -280,7 +284,7 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
 
 
 def _still(graph: Graph, record: Record, model: int, kind: str, curves: dict) -> None:
-    """Axes without a curve stand where the curve node says."""
+    """Add constant curves, where the curve node gives a value, for axes that have no curve."""
     given = _properties(record)
     for axis, letter in enumerate("XYZ"):
         value = given.get(f"d|{letter}", [])
@@ -289,7 +293,7 @@ def _still(graph: Graph, record: Record, model: int, kind: str, curves: dict) ->
 
 
 def _pieces(graph: Graph) -> list[Piece]:
-    """The triangles under each skin."""
+    """Return the triangles under each skin."""
     found = []
     for number, model in enumerate(graph.models):
         for key, mesh, _ in graph.under(model.key, "Geometry", "Mesh"):
@@ -299,6 +303,7 @@ def _pieces(graph: Graph) -> list[Piece]:
 
 
 def _piece(graph: Graph, number: int, mesh: Record, skin: int) -> Piece:
+    """Return the triangles of one mesh with the joints and weights of its skin."""
     fbx, model = graph.fbx, graph.models[number]
     where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
     x = fbx.array(mesh, "Vertices", where)
@@ -347,7 +352,7 @@ def _piece(graph: Graph, number: int, mesh: Record, skin: int) -> Piece:
 
 
 def _fans(corners: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Triangles of polygons, each a fan from its first corner; `last` marks the last corner of each."""
+    """Cut polygons into triangles, each by a fan from its first corner; `last` marks the last corner of each."""
     stop = np.flatnonzero(last) + 1
     start = np.concatenate([[0], stop[:-1]])
     count = np.maximum(stop - start - 2, 0)

@@ -1,4 +1,4 @@
-"""One number over time in FBX: keys with constant, linear or cubic spans between them."""
+"""Animation curves in FBX: one number over time, by keys with constant, linear or cubic spans between them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_jax.io.character.fbx import Fbx, Record
+from ncs_jax.io.character.spline import hermite
 
 __all__ = ["Curve", "curve_from"]
 
-CONSTANT, LINEAR = 2, 4  # of KeyAttrFlags; all others are cubic
-NEXT, GIVEN = 0x100, 0x400  # constant at the value of the next key; the slopes are given, and not those through the neighbours
+CONSTANT, LINEAR = 2, 4  # flags of KeyAttrFlags for the span after a key; without either it is cubic
+NEXT, GIVEN = 0x100, 0x400  # a constant span has the next key's value; the slopes are given, not found from the neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +25,9 @@ class Curve:
     flags: np.ndarray
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Values at times (n,); before the first key and after the last it stands still.
+        """Return the values (n,) at times (n,), s; constant before the first key and after the last.
 
-        A cubic span is Hermite's: the weights of tangents, which bend the time along it, are passed over.
+        A cubic span is Hermite's. The weights of its tangents, which bend time along it, are ignored.
         """
         last = len(self.times) - 1
         times = np.clip(times, self.times[0], self.times[-1])
@@ -36,18 +37,13 @@ class Curve:
         t = (times - self.times[low]) / np.where(span > 0, span, 1)
         a, b, flags = self.values[low], self.values[high], self.flags[low]
         linear = a + t * (b - a)
-        cubic = (
-            (2 * t**3 - 3 * t**2 + 1) * a
-            + span * (t**3 - 2 * t**2 + t) * self.slopes[low, 0]
-            + (3 * t**2 - 2 * t**3) * b
-            + span * (t**3 - t**2) * self.slopes[low, 1]
-        )
+        cubic = hermite(t, span, a, b, self.slopes[low, 0], self.slopes[low, 1])
         held = np.where((flags & NEXT > 0) & (t > 0) | (t >= 1), b, a)
         return np.where(flags & CONSTANT > 0, held, np.where(flags & LINEAR > 0, linear, cubic))
 
 
 def curve_from(fbx: Fbx, record: Record, where: str, tick: int) -> Curve:
-    """The keys of an AnimationCurve; `tick` is how many units of its times make a second."""
+    """Return the keys of an AnimationCurve; `tick` is how many units of its times make a second."""
     times = fbx.array(record, "KeyTime", where, whole=True) / tick
     values = fbx.array(record, "KeyValueFloat", where)
     flags = fbx.array(record, "KeyAttrFlags", where, whole=True)
@@ -70,9 +66,9 @@ def curve_from(fbx: Fbx, record: Record, where: str, tick: int) -> Curve:
 
 
 def _through(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The slopes of automatic tangents: half that from neighbour to neighbour, half the mean of the two beside the key by time.
+    """Return the slopes of automatic tangents: half from neighbour to neighbour, half the mean beside the key, by time.
 
-    Their bias and clamping, which only an animator's curves have, are passed over.
+    Bias and clamping, which only curves made by an animator have, are ignored.
     """
     if len(times) == 1:
         return np.zeros(1)

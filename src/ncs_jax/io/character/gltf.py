@@ -1,4 +1,4 @@
-"""The container of glTF 2.0 (.glb, .gltf): JSON, the buffers that it names, and typed arrays cut out of them."""
+"""The container of glTF 2.0 (.glb, .gltf): JSON, the buffers that it names, and the typed arrays in them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ncs_jax.io.tables.files import LARGEST, readable, reading, unpackable
 
 __all__ = ["Gltf", "read_gltf"]
 
-TEXT = 128 * 2**20  # bytes of JSON; parsed it takes some twenty times as many
+TEXT = 128 * 2**20  # bytes of JSON, at most; parsed it takes some twenty times as many
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-# What a file may require that changes neither shape nor movement. All else, Draco and meshopt first, would be misread.
+# Extensions that a file may require, because they change neither shape nor movement. With others it would be misread.
 HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_mesh_quantization", "KHR_xmp",
     "KHR_animation_pointer", "VRM", "VRMC_",
@@ -28,7 +28,7 @@ HARMLESS = (
 
 @dataclass(eq=False)
 class Gltf:
-    """A file's JSON and binary chunk. All is checked as it is taken out; arrays are kept and must fit into LARGEST."""
+    """A file's JSON and binary chunk. All is checked when it is taken out; arrays are kept, at most LARGEST bytes of them."""
 
     file: Path
     tree: dict
@@ -38,32 +38,32 @@ class Gltf:
     taken: int = 0
 
     def wrong(self, expected: str, where: str, value: object = None, mend: str = "export the file again") -> InputError:
-        """The error to raise about something in this file."""
+        """Return the error to raise about something in this file."""
         return InputError(expected, file=self.file, field=where, value=value, mend=mend)
 
     def objects(self, name: str, owner: dict | None = None, where: str = "") -> list[dict]:
-        """A list of objects, at the top of the file or in one of its objects; none where it is not there."""
+        """Return a list of objects, at the top of the file or in one of its objects; empty where it is not there."""
         found = (self.tree if owner is None else owner).get(name, [])
         if not isinstance(found, list) or not all(isinstance(o, dict) for o in found):
             raise self.wrong("a list of objects expected", f"{where} {name}".strip(), type(found).__name__)
         return found
 
     def object(self, name: str, owner: dict, where: str) -> dict:
-        """An object in another; an empty one where it is not there."""
+        """Return an object in another; an empty one where it is not there."""
         found = owner.get(name, {})
         if not isinstance(found, dict):
             raise self.wrong("an object expected", f"{where} {name}", found)
         return found
 
     def whole(self, name: str, owner: dict, where: str, below: int, default: int | None = None) -> int:
-        """A whole number from 0 to below - 1."""
+        """Return a whole number, after a check that it is from 0 to below - 1."""
         found = owner.get(name, default)
         if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found < below:
             raise self.wrong(f"a whole number from 0 to {below - 1} expected" if below else "nothing to refer to", where, found)
         return found
 
     def wholes(self, name: str, owner: dict, where: str, below: int) -> list[int]:
-        """A list of different whole numbers from 0 to below - 1; none where it is not there."""
+        """Return a list of different whole numbers from 0 to below - 1; empty where it is not there."""
         found = owner.get(name, [])
         if not isinstance(found, list):
             raise self.wrong("a list expected", f"{where} {name}", found)
@@ -73,7 +73,7 @@ class Gltf:
         return numbers
 
     def numbers(self, name: str, owner: dict, where: str, default: tuple[float, ...]) -> np.ndarray:
-        """As many finite numbers as the default has."""
+        """Return finite numbers, as many as the default has."""
         found = owner.get(name, default)
         good = isinstance(found, list | tuple) and len(found) == len(default)
         if not good or not all(isinstance(n, int | float) and abs(n) < 1e30 for n in found):
@@ -81,14 +81,14 @@ class Gltf:
         return np.array(found, np.float64)
 
     def text(self, name: str, owner: dict, where: str) -> str:
-        """A text; empty where it is not there."""
+        """Return a text; empty where it is not there."""
         found = owner.get(name, "")
         if not isinstance(found, str):
             raise self.wrong("a text expected", f"{where} {name}", found)
         return found
 
     def accessor(self, index: int, kinds: tuple[str, ...], where: str) -> np.ndarray:
-        """An accessor as rows (count, width) in its own type, finite; normalized integers become float64 from -1 to 1."""
+        """Return an accessor as rows (count, width) in its own type, finite; normalized integers become float64, -1 to 1."""
         if index not in self.arrays:
             self.arrays[index] = self._accessor(index)
         array = self.arrays[index]
@@ -132,13 +132,14 @@ class Gltf:
         return array
 
     def _take(self, where: str, size: int) -> None:
+        """Count the bytes of an array before it is read, and refuse too many."""
         unpackable(self.file, where, size)
         self.taken += size
         if self.taken > LARGEST:
             raise self.wrong(f"at most {LARGEST} bytes in all accessors expected", where, self.taken, "split the file")
 
     def _rows(self, owner: dict, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
-        """A fresh array of rows that stand in a buffer view, one row every `byteStride` bytes."""
+        """Return a new array of the rows in a buffer view, one row every `byteStride` bytes."""
         views = self.objects("bufferViews")
         view = views[self.whole("bufferView", owner, f"{where} bufferView", len(views))]
         packed = [n for n in self.object("extensions", view, f"{where} bufferView") if n.endswith("meshopt_compression")]
@@ -196,9 +197,9 @@ class Gltf:
 
 
 def read_gltf(path: str | Path) -> Gltf:
-    """Open a .glb or .gltf and check its frame; accessors are read when they are asked for.
+    """Open a .glb or .gltf and check its header and JSON; accessors are read when they are asked for.
 
-    Buffers may stand in the file, in a data URI, or in a file of the same folder or below. Nothing else is opened.
+    Buffers may be in the file, in a data URI, or in another file of the same folder or below. Nothing else is opened.
     """
     file = readable(path)
     size, most = file.stat().st_size, LARGEST if file.suffix.lower() == ".glb" else TEXT
@@ -234,7 +235,7 @@ def _no_number(name: str) -> float:
 
 
 def _chunks(file: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON and the binary chunk of a .glb."""
+    """Return the JSON and the binary chunk of a .glb."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise InputError("a .glb that begins with 'glTF' expected", file=file, value=data[:4], mend="export the file again")
     version, length = struct.unpack_from("<II", data, 4)

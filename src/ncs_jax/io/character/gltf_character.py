@@ -11,6 +11,7 @@ import numpy as np
 from ncs_jax.io.character.gltf import Gltf, read_gltf
 from ncs_jax.io.character.quaternions import slerp, to_matrix
 from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, motion_of, rig_from, unique_names
+from ncs_jax.io.character.spline import hermite
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import reading
 
@@ -44,10 +45,10 @@ class Channel:
 
 
 def gltf_body(path: str | Path) -> BodyRecord:
-    """The skinned character of a .glb or .gltf in the pose in which it was bound, m, Y up: see `rig_from`.
+    """Read the skinned character of a .glb or .gltf in the pose in which it was bound, m, Y up: see `rig_from`.
 
-    All meshes under a skin are joined, and vertices that only texture coordinates and normals split become one again. Meshes
-    without a skin, morph targets and materials are passed over.
+    All meshes under a skin are joined. Vertices that differ only in texture coordinates and normals are merged. Meshes without
+    a skin, morph targets and materials are ignored.
     """
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):
@@ -59,10 +60,11 @@ def gltf_body(path: str | Path) -> BodyRecord:
 
 
 def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """An animation of a .glb or .gltf since the pose of `gltf_body`; the first, or that of a name.
+    """Read an animation of a .glb or .gltf since the pose of `gltf_body`; the first, or the named one.
 
-    Times are those of the keys where these stand at a constant rate of 10 to 240 a second, else 30 a second from the first key
-    to the last. Joints without keys keep their node's place. Of a file without a skin, the nodes' own pose is at rest.
+    The frames are the keys, if they have a constant rate of 10 to 240 a second; else there are 30 a second, from the first key
+    to the last. Joints without keys keep their node's place. In a file without a skin, the rest pose is the one in which the
+    nodes stand.
     """
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):
@@ -76,6 +78,7 @@ def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
 
 
 def _nodes(gltf: Gltf) -> Nodes:
+    """Return all nodes, after a check that they form trees."""
     given = gltf.objects("nodes")
     count = len(given)
     if not 0 < count <= MOST_NODES:
@@ -104,6 +107,7 @@ def _nodes(gltf: Gltf) -> Nodes:
 
 
 def _unit(gltf: Gltf, q: np.ndarray, where: str) -> np.ndarray:
+    """Return quaternions (..., 4) divided by their lengths."""
     length = np.linalg.norm(q, axis=-1, keepdims=True)
     if (length < 1e-6).any():
         raise gltf.wrong("quaternions that are not zero expected", where, q[int(np.argmin(length))].tolist())
@@ -111,7 +115,7 @@ def _unit(gltf: Gltf, q: np.ndarray, where: str) -> np.ndarray:
 
 
 def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (), times: np.ndarray | None = None) -> np.ndarray:
-    """Node to world, M = M_parent T R S, of the wanted nodes: (n, 4, 4) as they stand, or (times, n, 4, 4)."""
+    """Return node to world, M = M_parent T R S, of the wanted nodes: (n, 4, 4) as they stand, or (times, n, 4, 4)."""
     line: list[int] = []
     for node in wanted:  # each after its parents
         above = []
@@ -137,7 +141,7 @@ def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (),
 
 
 def _pieces(gltf: Gltf) -> list[Piece]:
-    """The triangles under each skin."""
+    """Return the triangles under each skin."""
     meshes, skins = gltf.objects("meshes"), gltf.objects("skins")
     found: dict[int, list] = {}
     for i, node in enumerate(gltf.objects("nodes")):
@@ -151,6 +155,7 @@ def _pieces(gltf: Gltf) -> list[Piece]:
 
 
 def _piece(gltf: Gltf, skin: int, primitives: list[tuple[str, dict]]) -> Piece:
+    """Return the triangles of the primitives under one skin, with its joints and inverse bind matrices."""
     one, where = gltf.objects("skins")[skin], f"skin {skin}"
     joints = np.array(gltf.wholes("joints", one, where, len(gltf.objects("nodes"))), np.int64)
     if not len(joints):
@@ -174,7 +179,7 @@ def _piece(gltf: Gltf, skin: int, primitives: list[tuple[str, dict]]) -> Piece:
 
 
 def _triangles(gltf: Gltf, one: dict, where: str, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), faces (F, 3), and the joints that move each vertex with their weights (V, 4 or 8)."""
+    """Return vertices (V, 3), faces (F, 3), and for each vertex the joints that move it and their weights (V, 4, 8, ...)."""
     attributes = gltf.object("attributes", one, where)
     if "POSITION" not in attributes and "KHR_draco_mesh_compression" in gltf.object("extensions", one, where):
         raise gltf.wrong("plain arrays expected", where, "KHR_draco_mesh_compression", "export without mesh compression")
@@ -224,7 +229,7 @@ def _floats(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ..
 
 
 def _tracks(gltf: Gltf, nodes: Nodes, name: str) -> list[Channel]:
-    """The key frames of one animation; those of morph targets and of other properties are passed over."""
+    """Return the key frames of one animation; those of morph targets and of other properties are ignored."""
     animations = gltf.objects("animations")
     names = [gltf.text("name", a, f"animation {i}") for i, a in enumerate(animations)]
     number = clip_named(gltf.file, names, name)
@@ -248,6 +253,7 @@ def _tracks(gltf: Gltf, nodes: Nodes, name: str) -> list[Channel]:
 
 
 def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Channel:
+    """Return the key frames of one property of one node."""
     mode = gltf.text("interpolation", sampler, label) or "LINEAR"
     if mode not in ("LINEAR", "STEP", "CUBICSPLINE"):
         raise gltf.wrong("LINEAR, STEP or CUBICSPLINE expected", label, mode)
@@ -265,7 +271,7 @@ def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Chann
 
 
 def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
-    """The property (times, width); before the first key and after the last it stands still."""
+    """Return a property (times, width) at times (s); constant before the first key and after the last."""
     keys, last = track.times, len(track.times) - 1
     times = np.clip(times, keys[0], keys[-1])
     low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, last)
@@ -282,19 +288,14 @@ def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
         if track.mode == "LINEAR":
             return track.values[low] * (1 - t) + track.values[low + 1] * t
         arriving, values, leaving = track.values[::3], track.values[1::3], track.values[2::3]
-        found = (
-            (2 * t**3 - 3 * t**2 + 1) * values[low]
-            + span * (t**3 - 2 * t**2 + t) * leaving[low]
-            + (3 * t**2 - 2 * t**3) * values[low + 1]
-            + span * (t**3 - t**2) * arriving[low + 1]
-        )
+        found = hermite(t, span, values[low], values[low + 1], leaving[low], arriving[low + 1])
     if track.path == "rotation":
         found = found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-12)
     return found
 
 
 def _span(tracks: Sequence[Channel]) -> tuple[float, float, float]:
-    """Begin and end of an animation, s, and its frames per second: those of the keys, or 30."""
+    """Return begin and end of an animation, s, and its frames per second: those of the keys, or 30."""
     begin, end = min(float(t.times[0]) for t in tracks), max(float(t.times[-1]) for t in tracks)
     keys = np.unique(np.concatenate([np.round(t.times, 5) for t in tracks]))
     if len(keys) > 2:

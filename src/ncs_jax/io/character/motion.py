@@ -27,7 +27,7 @@ FORMATS = (".npz", ".h5", ".hdf5", ".bvh", ".glb", ".gltf", ".fbx")
 
 
 class MotionSkeleton(NamedTuple):
-    """Fields of a MotionRecord."""
+    """The skeleton of a motion, as in a MotionRecord."""
 
     joints: np.ndarray | None
     parents: np.ndarray | None
@@ -38,18 +38,18 @@ class MotionSkeleton(NamedTuple):
 def read_motion(
     path: str | Path, *, frame_range: tuple[int, int | None] | None = None, scale: float | int = 1.0
 ) -> MotionRecord:
-    """A motion as local rotations since rest, axis times angle, and the root's translation since rest.
+    """Read a motion: local rotations since rest, axis times angle, and the root's translation since rest.
 
     .npz and .h5 hold `poses` (T, J, 3) or (T, 3 J), or `quaternions` (T, J, 4) with w first and of any length but zero; `trans`
-    (T, 3); and `fps`, in AMASS `mocap_framerate` or `mocap_frame_rate`, whose world has Z up. AMASS may have its poses in
-    parts: `root_orient` (T, 3), `pose_body` (T, 63), and `pose_hand` (T, 90) with or without `pose_jaw` and `pose_eye`.
-    `joint_names` (J,) may be there, and the skeleton, `joints` (J, 3) with `parents` (J,). A .bvh has both; its translation is
-    the root's position less the root's OFFSET. Of .glb, .gltf and .fbx, see `gltf_motion` and `fbx_motion`; FILE.glb#NAME names
-    one animation of several, of which the first is read otherwise.
+    (T, 3); and `fps`. AMASS writes `mocap_framerate` or `mocap_frame_rate` instead of `fps`, and its world has Z up. Its poses
+    may be in parts: `root_orient` (T, 3), `pose_body` (T, 63), and `pose_hand` (T, 90) with or without `pose_jaw` and
+    `pose_eye`. The file may hold `joint_names` (J,), and a skeleton, `joints` (J, 3) with `parents` (J,). A .bvh has both; its
+    translation is the root's position less the root's OFFSET. For .glb, .gltf and .fbx, see `gltf_motion` and `fbx_motion`.
+    FILE.glb#NAME names one of several animations; without a name the first is read.
 
     Args:
-        path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end. Other frames may be
-            broken. scale: metres per unit of the file's lengths, for .bvh often 0.01 or 0.0254.
+        path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end. Other frames may hold
+            numbers that are not finite. scale: metres a unit of the file's lengths, for .bvh often 0.01 or 0.0254.
 
     Raises:
         InputError: the file cannot be read; or shapes disagree, a chosen frame has a number that is not finite or a quaternion
@@ -98,7 +98,7 @@ def read_motion(
 
 
 def _rotations(table: Table) -> np.ndarray:
-    """Poses (T, J, 3) or quaternions (T, J, 4), unchecked but for their shape."""
+    """Return poses (T, J, 3) or quaternions (T, J, 4); only their shape is checked."""
     if "poses" not in table and "quaternions" not in table and "root_orient" in table:
         return _in_parts(table)
     name = table.first("poses", "quaternions")
@@ -121,7 +121,7 @@ def _rotations(table: Table) -> np.ndarray:
 
 
 def _in_parts(table: Table) -> np.ndarray:
-    """Poses of AMASS that are written by part: SMPL-H without jaw and eyes, SMPL-X with them, or the body's 22 joints alone."""
+    """Join AMASS poses that are written in parts: SMPL-H without jaw and eyes, SMPL-X with them, or the body's 22 joints."""
     frames, face = len(table.array("root_orient")), "pose_jaw" in table or "pose_eye" in table
     width = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
     parts = [table.floats(name, (frames, width[name]), ("frame",)) for name in ("root_orient", "pose_body")]
@@ -135,6 +135,7 @@ def _in_parts(table: Table) -> np.ndarray:
 
 
 def _from_quaternions(file: Path, q: np.ndarray, labels: list[str], start: int) -> np.ndarray:
+    """Return axis times angle (T, J, 3) of quaternions (T, J, 4), after a check that none is zero."""
     length = np.linalg.norm(q.astype(np.float64), axis=-1)
     bad = np.argwhere(length < 1e-6)
     if len(bad):

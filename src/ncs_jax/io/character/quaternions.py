@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z), as far as files need them."""
+"""Quaternions (w, x, y, z) in NumPy, for the readers and writers of files."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ __all__ = ["about_axis", "from_axis_angle", "from_matrix", "multiply", "slerp", 
 
 
 def about_axis(axis: int, angle: np.ndarray) -> np.ndarray:
-    """Turn by an angle (N,), rad, about a coordinate axis: (N, 4)."""
+    """Return quaternions (N, 4) that turn by an angle (N,), rad, about a coordinate axis."""
     q = np.zeros((*np.shape(angle), 4))
     q[..., 0], q[..., axis + 1] = np.cos(angle / 2), np.sin(angle / 2)
     return q
 
 
 def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) of axis times angle (..., 3), rad."""
+    """Return unit quaternions (..., 4) of axis times angle (..., 3), rad."""
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     half = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle / 2) / angle
     return np.concatenate([np.cos(angle / 2), half * vectors], axis=-1)
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The product p q (..., 4): first q turns, then p."""
+    """Return the product p q (..., 4): first q turns, then p."""
     a, u, b, v = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
     return np.concatenate([a * b - (u * v).sum(-1, keepdims=True), a * v + b * u + np.cross(u, v)], axis=-1)
 
 
 def to_axis_angle(q: np.ndarray) -> np.ndarray:
-    """Axis times angle (..., 3), rad, of quaternions (..., 4) of any length but zero; the angle is at most pi.
+    """Return axis times angle (..., 3), rad, of quaternions (..., 4) of any length but zero; the angle is at most pi.
 
-    q and -q are one rotation and give one result: of the two, the one with w >= 0 is taken.
+    q and -q are the same rotation and give the same result: the one with w >= 0 is used.
     """
     q = np.where(q[..., :1] < 0, -q, q)
     length = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -40,7 +40,7 @@ def to_axis_angle(q: np.ndarray) -> np.ndarray:
 
 
 def to_matrix(q: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -51,7 +51,7 @@ def to_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def from_matrix(r: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4), of any length but zero, of rotation matrices (..., 3, 3); of four ways the best (Shepperd 1978)."""
+    """Return quaternions (..., 4), not of unit length, of rotation matrices (..., 3, 3), by the method of Shepperd (1978)."""
     (a, f, e), (c, b, g), (d, h, i) = np.moveaxis(r, (-2, -1), (0, 1))
     ways = np.stack(
         [
@@ -67,7 +67,7 @@ def from_matrix(r: np.ndarray) -> np.ndarray:
 
 
 def slerp(p: np.ndarray, q: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """From unit quaternion p to q (..., 4) along the shorter arc, by the share t (...)."""
+    """Interpolate from unit quaternion p to q (..., 4) along the shorter arc, by the share t (...)."""
     q = np.where((p * q).sum(-1, keepdims=True) < 0, -q, q)
     angle = 2 * np.arctan2(np.linalg.norm(q - p, axis=-1), np.linalg.norm(q + p, axis=-1))
     small = angle < 1e-6

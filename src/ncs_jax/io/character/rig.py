@@ -1,4 +1,4 @@
-"""A skinned character as 4 x 4 matrices, as .glb and .fbx hold it, and the body and the motion that come of it."""
+"""A skinned character as 4 x 4 matrices, as .glb and .fbx hold it, and the body and the motion made from it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.character.hierarchy import by_depth, lowest_common, nearest_parents, path_to_root
 from ncs_jax.io.character.quaternions import from_matrix, to_axis_angle
+from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import LARGEST
 
 __all__ = ["MOST_NODES", "Piece", "Rig", "body_of", "clip_named", "motion_of", "rig_from", "split_clip", "unique_names"]
 
-GIVE = 0.01  # m that a bone may change, and the share by which a joint may scale, before that is an error and not left out
+GIVE = 0.01  # m by which a bone may change, and share by which a joint may scale; more is an error, less is ignored
 MOST_NODES = 20_000  # of a file
 HOUR = 3600.0  # s; the longest animation
 BLOCK = 256  # frames evaluated at once
-SAME = 1e-3  # of the size of the character: bind matrices that differ by less are one
+SAME = 1e-3  # of the size of the character: bind matrices that differ by less are the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,7 @@ class Piece:
     Attributes:
         vertices: (V, 3) in the space where they were bound. faces: (F, 3). owners, weights: (V, K), numbers into `nodes`, and
             how much each moves the vertex. nodes: (S,) of the file. inverse_binds: (S, 4, 4) from that space to each node.
-            bound: (4, 4) from that space to the world, where the file says.
+            bound: (4, 4) from that space to the world, None where the file does not say.
     """
 
     vertices: np.ndarray
@@ -44,12 +46,12 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Joints with the places that they were bound in, and the skin, in metres, Y up, in the bind pose.
+    """Joints and skin in the bind pose, in metres and Y up.
 
     Attributes:
-        file: where it is from. nodes: (J,) of the file that are the joints. names: theirs. parents: (J,), -1 for the root.
-            binds: (J, 4, 4) joint to world in the bind pose. used: (J,) moves some vertex, itself or below.
-            vertices: (V, 3). faces: (F, 3). weights: (V, J). Of a file without a skin there are no vertices.
+        file: the path. nodes: (J,) the file's nodes that are the joints. names: their names. parents: (J,), -1 for the root.
+            binds: (J, 4, 4) joint to world in the bind pose. used: (J,) whether a joint, or one below it, moves some vertex.
+            vertices: (V, 3). faces: (F, 3). weights: (V, J). A file without a skin has no vertices.
     """
 
     file: Path
@@ -64,13 +66,13 @@ class Rig:
 
 
 def split_clip(path: str | Path) -> tuple[str, str]:
-    """The file and the animation that `FILE.glb#NAME` names; the name is empty where none is given."""
+    """Return the file and the animation that `FILE.glb#NAME` names; the name is empty where none is given."""
     found = re.match(r"(.+?\.(?:glb|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
     return (found[1], found[2] or "") if found else (str(path), "")
 
 
 def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
-    """The number of the animation of a name; the first where none is given."""
+    """Return the number of the animation that has a name; the first where none is given."""
     if not names:
         raise InputError("an animation expected", file=file, field="animations", value="none", mend="export it with animation")
     if wanted and wanted not in names:
@@ -82,7 +84,7 @@ def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The same names, with the number of the node added where a name is empty or another's too."""
+    """Return names that are all different: the node's number is added to those that are empty or occur twice."""
     return tuple(n if n and names.count(n) == 1 else f"{n or 'node'}_{i}" for i, n in enumerate(names))
 
 
@@ -96,50 +98,44 @@ def rig_from(
 ) -> Rig:
     """Put joints and pieces together in one rest pose, the one in which the skin was bound.
 
-    Joints rest where the inverse bind matrices say and not where the nodes stand: only from there do the joints' movements give
-    the skin as the file means it. Nodes may stand in any pose; exporters leave some frame in them. How the bound character
-    stands in the world is what the joints' nodes agree on, where they are in the bind pose; else where the file says that the
-    skin was bound (FBX); else the place of the root's node, and the turn of the armature or the quarter turns that are
-    nearest to how the joints have turned on the whole.
+    Joints rest where the inverse bind matrices say, and not where the nodes stand: only from there do the joints' movements
+    give the skin as the file means it. Nodes may stand in any pose; exporters leave some frame in them. Where the bound
+    character stands in the world is what the joints' nodes agree on, if they are in the bind pose; else where the file says
+    that the skin was bound (FBX); else the place of the root's node, with the turn of the armature or the quarter turn that is
+    nearest to the mean turn of the joints.
 
-    The root is the lowest node above all joints that move a vertex. A root bone of the file, which moves none and below which
-    the pelvis moves, is no joint, nor are controls beside it.
+    The root is the lowest node above all joints that move a vertex. A root bone of the file that moves no vertex, and below
+    which the pelvis moves, is no joint, nor are controls beside it.
 
     Args:
-        file: for errors. names, parents, rest: of all nodes (N,), (N,), (N, 4, 4) node to world. pieces: at least one of which
-            has a vertex; where there is none, the joints are the nodes above, between and below those `turning`, at rest.
+        file: for errors. names, parents, rest: of all nodes (N,), (N,), (N, 4, 4) node to world. pieces: each has a vertex.
+        turning: nodes that turn. Where there is no piece, the joints are the nodes above, between and below these, at rest.
+
+    Raises:
+        InputError: there is neither a piece nor a node that turns, the pieces hang on several skeletons or were bound in
+            several poses, weights do not sum to 1, or a matrix has no inverse.
     """
     if not pieces:
-        if not len(turning):
-            raise InputError(
-                "a skin, or nodes that turn, expected", file=file, field="nodes", mend="export a skinned character"
-            )
-        root = _common(parents, turning)
-        joints = _by_depth(parents, [n for n in range(len(parents)) if root in _line(parents, n)])
-        none = np.zeros((0, 3))
-        used = np.ones(len(joints), bool)
-        above = _parents(parents, joints)
-        own = unique_names([names[n] for n in joints])
-        return Rig(file, np.array(joints), own, above, rest[joints], used, none, none.astype(np.int32), none[:, :0])
+        return _rig_without_skin(file, names, parents, rest, turning)
     for piece in pieces:
         _check(file, names, piece)
     moving = {int(p.nodes[k]) for p in pieces for k in np.unique(p.owners[p.weights > 0])}
-    root = _common(parents, sorted(moving))
+    root = lowest_common(parents, sorted(moving))
     if root < 0:
         raise InputError("one skeleton expected", file=file, field="nodes", value="several", mend="export one character")
     listed = {int(n) for p in pieces for n in p.nodes}
-    joints = _by_depth(parents, [n for n in listed | {root} if root in _line(parents, n)])
-    place = {n: j for j, n in enumerate(joints)}
+    joints = by_depth(parents, [n for n in listed | {root} if root in path_to_root(parents, n)])
+    number = {n: j for j, n in enumerate(joints)}
     binds: dict[int, np.ndarray] = {}
-    bodies = []
+    placed = []
     for piece in sorted(pieces, key=lambda p: -len(p.vertices)):
         to_world = _to_world(file, names, parents, rest, piece, binds)
         for node, inverse in zip(piece.nodes.tolist(), piece.inverse_binds, strict=True):
-            if node in place:
+            if node in number:
                 binds.setdefault(node, to_world @ np.linalg.inv(inverse))
-        bodies.append(_placed(piece, to_world, place))
-    vertices, faces, weights = _joined(file, bodies, len(joints))
-    above = _parents(parents, joints)
+        placed.append(_placed(piece, to_world, number))
+    vertices, faces, weights = _joined(file, placed, len(joints))
+    above = nearest_parents(parents, joints)
     used = np.array([n in moving for n in joints])
     for j in range(len(joints) - 1, 0, -1):
         used[above[j]] |= used[j]
@@ -149,7 +145,21 @@ def rig_from(
     )  # fmt: skip
 
 
+def _rig_without_skin(file: Path, names: Sequence[str], parents: np.ndarray, rest: np.ndarray, turning: Sequence[int]) -> Rig:
+    """Return a rig without vertices: the nodes above, between and below those that turn, bound where they rest."""
+    if not len(turning):
+        raise InputError("a skin, or nodes that turn, expected", file=file, field="nodes", mend="export a skinned character")
+    root = lowest_common(parents, turning)
+    joints = by_depth(parents, [n for n in range(len(parents)) if root in path_to_root(parents, n)])
+    none = np.zeros((0, 3))
+    return Rig(
+        file, np.array(joints), unique_names([names[n] for n in joints]), nearest_parents(parents, joints), rest[joints],
+        np.ones(len(joints), bool), none, none.astype(np.int32), none[:, :0],
+    )  # fmt: skip
+
+
 def _check(file: Path, names: Sequence[str], piece: Piece) -> None:
+    """Raise an InputError unless weights sum to about 1 and inverse bind matrices can be inverted."""
     sums = np.maximum(piece.weights, 0).sum(axis=1)
     bad = ~(np.abs(sums - 1) < 0.1)
     if bad.any():
@@ -167,41 +177,14 @@ def _check(file: Path, names: Sequence[str], piece: Piece) -> None:
         )  # fmt: skip
 
 
-def _line(parents: np.ndarray, node: int) -> list[int]:
-    """A node, its parent, and so on to the top."""
-    line = [node]
-    while (node := int(parents[node])) >= 0:
-        line.append(node)
-    return line
-
-
-def _common(parents: np.ndarray, nodes: Sequence[int]) -> int:
-    """The lowest node that is each of these or above it; -1 where there is none."""
-    shared = _line(parents, nodes[0])
-    for node in nodes[1:]:
-        line = set(_line(parents, node))
-        shared = [n for n in shared if n in line]
-    return shared[0] if shared else -1
-
-
-def _by_depth(parents: np.ndarray, nodes: Sequence[int]) -> list[int]:
-    return sorted(nodes, key=lambda n: (len(_line(parents, n)), n))
-
-
-def _parents(parents: np.ndarray, joints: list[int]) -> np.ndarray:
-    """The nearest joint above each; nodes between them move with it or are seen in the joint's own movement."""
-    place = {n: j for j, n in enumerate(joints)}
-    return np.array([next((place[n] for n in _line(parents, j)[1:] if n in place), -1) for j in joints], np.int32)
-
-
 def _to_world(
     file: Path, names: Sequence[str], parents: np.ndarray, rest: np.ndarray, piece: Piece, binds: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """The matrix (4, 4) from the space in which a piece was bound to the world in which it stands."""
-    moving = sorted(np.unique(piece.owners[piece.weights > 0]), key=lambda k: len(_line(parents, int(piece.nodes[k]))))
-    known = [k for k in moving if int(piece.nodes[k]) in binds]
-    seen = known or moving
-    worlds = np.array([binds[int(piece.nodes[k])] if known else rest[piece.nodes[k]] for k in seen])
+    """Return the matrix (4, 4) from the space in which a piece was bound to the world in which it stands."""
+    moving = sorted(np.unique(piece.owners[piece.weights > 0]), key=lambda k: len(path_to_root(parents, int(piece.nodes[k]))))
+    already = [k for k in moving if int(piece.nodes[k]) in binds]  # bound by another piece
+    seen = already or moving
+    worlds = np.array([binds[int(piece.nodes[k])] if already else rest[piece.nodes[k]] for k in seen])
     found = worlds @ piece.inverse_binds[seen]
     low = piece.vertices.min(axis=0)
     corners = low + np.ptp(piece.vertices, axis=0).max() * np.eye(4, 3)  # one of a cube around it, and the three beside that
@@ -210,7 +193,7 @@ def _to_world(
     apart = np.abs(ends - ends[:1]).max(axis=(1, 2))
     if apart.max() <= SAME * size:
         return found[0]
-    if known:
+    if already:
         raise InputError(
             "one bind pose for all meshes expected", file=file, value=f"{apart.max():.3g} m apart",
             field=f"joint {names[int(piece.nodes[seen[int(apart.argmax())]])]}",
@@ -225,21 +208,23 @@ def _to_world(
     return out
 
 
-def _upright(ways: np.ndarray, share: np.ndarray, armature: np.ndarray) -> np.ndarray:
-    """Scale of the first way (K, 4, 4) from bound space to world, and the turn of the armature's node or the quarter turns,
-    whichever is nearest to the mean turn of all ways."""
-    left, _, right = np.linalg.svd(ways[:, :3, :3])
+def _upright(matrices: np.ndarray, share: np.ndarray, armature: np.ndarray) -> np.ndarray:
+    """Return a matrix (4, 4) from bound space to world that fits several (K, 4, 4), up to its translation.
+
+    It has the scale of the first, and of the armature's turn and all quarter turns the one nearest to the mean turn.
+    """
+    left, _, right = np.linalg.svd(matrices[:, :3, :3])
     turn = np.einsum("j,jab->ab", share, left @ right)
-    candidates = _quarter_turns(np.sign(np.linalg.det(ways[0, :3, :3])))
+    candidates = _quarter_turns(np.sign(np.linalg.det(matrices[0, :3, :3])))
     left, _, right = np.linalg.svd(armature[:3, :3])
     candidates.append(left @ right)
     out = np.eye(4)
-    out[:3, :3] = max(candidates, key=lambda q: float((q * turn).sum())) * np.cbrt(abs(np.linalg.det(ways[0, :3, :3])))
+    out[:3, :3] = max(candidates, key=lambda q: float((q * turn).sum())) * np.cbrt(abs(np.linalg.det(matrices[0, :3, :3])))
     return out
 
 
 def _quarter_turns(sign: float) -> list[np.ndarray]:
-    """The 24 rotations that map axes to axes, or the 24 that mirror too."""
+    """Return the 24 rotations that map axes to axes, or the 24 that also mirror."""
     found = []
     for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
         for signs in np.ndindex(2, 2, 2):
@@ -258,7 +243,7 @@ def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple[
 
 
 def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, faces and dense weights of all pieces; vertices at one place (to 1 um) that move alike become one."""
+    """Return vertices, faces and dense weights of all pieces; vertices at one place (to 1 um) with equal weights are merged."""
     count = sum(len(b[0]) for b in bodies)
     if count * joints * 8 > LARGEST:
         raise InputError("a smaller body expected", file=file, field="skin", value=f"{count} vertices, {joints} joints")
@@ -270,12 +255,8 @@ def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarr
         np.add.at(weights, (start + np.arange(len(own))[:, None], owners), np.maximum(own, 0))
     weights /= weights.sum(axis=1, keepdims=True)
     key = np.concatenate([np.round(x * 1e6), np.round(weights * 1e4)], axis=1)
-    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")  # in the order in which the places first appear
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    faces = rank[number.reshape(-1)][faces]
-    kept = first[order]
+    kept, number = distinct(key)
+    faces = number[faces]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     if not whole.any():
         raise InputError("triangles expected", file=file, field="skin", value="none", mend="export the character's mesh")
@@ -283,7 +264,7 @@ def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _all_binds(joints: list[int], parents: np.ndarray, rest: np.ndarray, binds: dict[int, np.ndarray]) -> np.ndarray:
-    """Where no skin binds a joint, it stands to its nearest bound relative as its node does."""
+    """Return the bind matrices of all joints; one that no skin binds stands to its nearest bound relative as its node does."""
     found = {j: binds[n] for j, n in enumerate(joints) if n in binds}
     children = [(int(parents[j]), j) for j in range(len(joints) - 1, 0, -1)]
     for here, other in children + [(j, p) for p, j in reversed(children)]:
@@ -293,14 +274,14 @@ def _all_binds(joints: list[int], parents: np.ndarray, rest: np.ndarray, binds: 
 
 
 def _rest_rotations(rig: Rig) -> np.ndarray:
-    """(J, 3, 3) the rotation nearest to each bind matrix."""
+    """Return the rotation nearest to each bind matrix (J, 3, 3)."""
     left, _, right = np.linalg.svd(rig.binds[:, :3, :3])
     turns = left @ right
     return turns * np.sign(np.linalg.det(turns))[:, None, None]
 
 
 def body_of(rig: Rig) -> BodyRecord:
-    """The character at rest, which is the pose that its skin was bound in."""
+    """Return the character at rest, in the pose in which its skin was bound."""
     if not len(rig.vertices):
         raise InputError("a skinned mesh expected", file=rig.file, field="skins", value="none", mend="export it with its skin")
     return BodyRecord(
@@ -309,17 +290,18 @@ def body_of(rig: Rig) -> BodyRecord:
 
 
 def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.ndarray], np.ndarray]) -> MotionRecord:
-    """Local rotations since rest, in the joints' own rest frames, of joints that move as a file says.
+    """Return the motion of joints that move as a file says: local rotations since rest, in the joints' own rest frames.
 
-    A joint has turned by G_j = A_j B_j^-1, its matrix now by its bind matrix, and in its own frame, as seen from its parent, by
-    R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation.
+    Since rest a joint has turned in the world by G_j = A_j B_j^-1, its matrix now times the inverse of its bind matrix. In its
+    own frame, seen from its parent, that is R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation.
 
     Args:
-        rig: whose joints. times: begin and end, s, and frames per second. worlds: (n,) s to (n, J, 4, 4) joint to world.
+        rig: the joints. times: begin and end, s, and frames per second. worlds: gives, for times (n,) in s, the matrices
+            (n, J, 4, 4) joint to world.
 
     Raises:
-        InputError: it lasts an hour, a joint scales by more than 1 % or a bone's length or place by more than 1 cm; the rest of
-            these is left out. Joints that move no vertex may do both.
+        InputError: the motion lasts an hour or more, a joint scales by more than 1 %, or a joint leaves its place on its parent
+            by more than 1 cm. Less than that is ignored. Joints that move no vertex may do both.
     """
     begin, end, fps = times
     count = int(np.floor((end - begin) * fps + 1e-3)) + 1 if end - begin < HOUR else 0
@@ -345,7 +327,10 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
 
 
 def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
-    """The rotations in (T, J, 3, 3), which the joints in use must be but for rounding; of the others, what is one."""
+    """Return the rotations in matrices (T, J, 3, 3).
+
+    The matrix of a used joint must be one but for rounding. For other joints what is none becomes the identity.
+    """
     with np.errstate(all="ignore"):
         scale = np.cbrt(np.linalg.det(linear))
         turns = linear / scale[..., None, None]
@@ -363,11 +348,12 @@ def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
 
 
 def _check_bones(rig: Rig, off: np.ndarray, first: int) -> None:
+    """Raise an InputError where a used joint is off (T, J - 1, 3), m, from its place on its parent."""
     far = np.where(rig.used[1:], np.linalg.norm(off, axis=-1), 0)
     if far.max(initial=0) > GIVE or not np.isfinite(far).all():
         t, j = (int(i) for i in np.unravel_index(np.argmax(np.where(np.isfinite(far), far, np.inf)), far.shape))
         raise InputError(
             "bones of fixed length expected, as in the bind pose", file=rig.file,
             field=f"animation, frame {t + first}, joint {rig.names[j + 1]}", value=f"{far[t, j]:.3g} m from its place",
-            mend="animate rotations only, but for the root",
+            mend="animate only rotations, and translations of the root",
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The joints of SMPL, SMPL-H and SMPL-X: their names and their tree, told apart by how many they are."""
+"""The joints of SMPL, SMPL-H and SMPL-X, names and tree; the number of joints tells which model it is."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ HANDS[55] = ("jaw", "left_eye_smplhf", "right_eye_smplhf", *HANDS[52])  # the na
 
 
 def smpl_names(joints: int) -> tuple[str, ...]:
-    """Their names where 22 (the body alone), 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints are given, else none."""
+    """Return the names of 22 (the body alone), 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints; none for other numbers."""
     return (*TRUNK, *HANDS[joints]) if joints in HANDS else ()
 
 
 def smpl_parents(joints: int) -> np.ndarray:
-    """(joints,) int32 of 22, 24, 52 or 55: each finger's first joint hangs on its wrist, jaw and eyes on the head."""
+    """Return the parents (joints,) int32 of 22, 24, 52 or 55 joints.
+
+    Each finger's first joint hangs on the wrist, jaw and eyes on the head.
+    """
     names = smpl_names(joints)
     parents = list(TREE)
     for j, name in enumerate(names[len(TREE) :], len(TREE)):

@@ -6,7 +6,7 @@ import numpy as np
 
 __all__ = ["TURNS", "upright"]
 
-# What turns an axis that is up to Y, about a third one that stays; a point, as a row, times it.
+# For each axis that may be up, the rotation that turns it to Y; it multiplies points, as rows, from the right.
 TURNS = {
     "x": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
     "y": np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
@@ -15,8 +15,8 @@ TURNS = {
 
 
 def upright(x: np.ndarray, scale: float, up: str) -> np.ndarray:
-    """Points (..., 3) of a file with so many metres a unit and that axis up, in metres and Y up; what is so stays as it is."""
+    """Return points (..., 3) of a file in metres and Y up, given its metres a unit and its axis that is up."""
     if scale == 1 and up == "y":
         return x
-    with np.errstate(over="ignore", invalid="ignore"):  # what gets too large is refused by whoever reads it
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that get too large are refused by the reader
         return np.ascontiguousarray(x @ TURNS[up].astype(x.dtype) * x.dtype.type(scale))

@@ -23,21 +23,21 @@ __all__ = ["read_garment", "write_garment"]
 GROUP = "group_"
 WEIGHTS = "blend_weights"
 FORMATS = (".npz", ".obj", ".ply", ".stl", ".glb", *USD)
-SPLITTING = (".stl", ".glb")  # a vertex once for each triangle, or for each texture coordinate and normal: it would come apart
+SPLITTING = (".stl", ".glb")  # store a vertex once for each triangle, texture coordinate or normal: the cloth would come apart
 
 
 def read_garment(path: str | Path, *, scale: float = 0.0, up: str = "", weld: float = 0.0) -> GarmentRecord:
-    """A garment in its rest shape on the resting body, in metres and Y up.
+    """Read a garment in its rest shape on the resting body, in metres and Y up.
 
     .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2), vertex sets `group_NAME` and skinning weights
-    `blend_weights` (V, J) of the body's joints. The vertices of every format but two keep the file's order and number; in .stl
-    and .glb, which store a vertex many times, those at exactly one place become one, in order of first appearance. Polygons
-    become triangles that do not fold, see `triangulate`.
+    `blend_weights` (V, J) for the body's joints. Vertices keep the file's order and number, but for .stl and .glb, which store
+    a vertex many times: there, vertices at exactly one place are merged, in order of first appearance. Polygons become
+    triangles that do not fold, see `triangulate`.
 
     Args:
         path: the file. scale: metres a unit of the file; 0: as the file says, else 1 (USD says it, .glb is in metres).
-        up: the axis that is up in the file, "x", "y" or "z"; empty: as the file says, else "y". weld: m; vertices within it
-            of each other become one, see `weld`; 0: none do.
+        up: the axis that is up in the file, "x", "y" or "z"; empty: as the file says, else "y". weld: vertices within this
+            distance of each other are merged, m, see `weld`; 0: none are.
 
     Raises:
         InputError: the file cannot be read; or the mesh is empty, has a corner that does not exist, a number that is not

@@ -8,7 +8,7 @@ __all__ = ["vertex_normals"]
 
 
 def vertex_normals(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) float32 of vertices (V, 3): those of the triangles around, weighted by area; +Y where they cancel."""
+    """Return unit normals (V, 3) float32 of vertices: the mean of the triangles around, by area; +Y where they cancel."""
     a, b, c = (x[faces[:, k]].astype(np.float64) for k in range(3))
     double = np.cross(b - a, c - a)
     corners = faces.T.reshape(-1)

@@ -14,11 +14,10 @@ __all__ = ["format_obj", "read_obj"]
 
 
 def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
-    """The file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2).
+    """Read an .obj: the file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2).
 
-    Polygons are cut as `triangulate` says, negative numbers count back from the last vertex, and objects, groups,
-    materials, normals, lines and points are passed over. Texture coordinates are None where a vertex has none, or two that
-    differ.
+    Polygons are cut as `triangulate` says. Negative numbers count back from the last vertex. Objects, groups, materials,
+    normals, lines and points are ignored. Texture coordinates are None where a vertex has none, or two that differ.
     """
     file, text = text_of(path)
     vertices: list[list[float]] = []
@@ -42,7 +41,7 @@ def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray
 
 
 def _lines(text: str):
-    """Line number and words of each line that says something; a backslash joins a line with the next."""
+    """Yield line number and words of each line that is not empty or a comment; a backslash joins a line with the next."""
     kept: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#", 1)[0].split()
@@ -69,7 +68,7 @@ def _numbers(file: Path, line: int, words: list[str], count: int) -> list[float]
 
 
 def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -> tuple[int, int]:
-    """Numbers from 0 of a corner's vertex and texture coordinate (-1: none) in `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
+    """Return a corner's vertex and texture coordinate, from 0 (-1: none), of `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
     parts = word.split("/")
     try:
         vertex = int(parts[0])
@@ -79,7 +78,7 @@ def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -
     v = vertex - 1 if vertex > 0 else vertices + vertex
     if vertex == 0 or not 0 <= v < vertices:
         raise InputError(
-            f"a vertex from 1 to {vertices} expected, of those above", file=file, field=f"faces, line {line}", value=vertex,
+            f"a vertex from 1 to {vertices} expected, one listed above", file=file, field=f"faces, line {line}", value=vertex,
             mend="counting starts at 1; export the mesh again",
         )  # fmt: skip
     if coordinate is None:
@@ -87,7 +86,7 @@ def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -
     t = coordinate - 1 if coordinate > 0 else coordinates + coordinate
     if coordinate == 0 or not 0 <= t < coordinates:
         raise InputError(
-            f"a texture coordinate from 1 to {coordinates} expected, of those above", file=file, field=f"faces, line {line}",
+            f"a texture coordinate from 1 to {coordinates} expected, one listed above", file=file, field=f"faces, line {line}",
             value=coordinate, mend="export the mesh again, or without texture coordinates",
         )  # fmt: skip
     return v, t
@@ -106,6 +105,6 @@ def _per_vertex(count: int, coordinates: list[list[float]], corners: list[tuple[
 
 
 def format_obj(vertices: np.ndarray, faces: str) -> str:
-    """One frame as text; `faces` is text already, as it is the same in every frame."""
+    """Return one frame as the text of an .obj; `faces` is text already, because it is the same in every frame."""
     flat = np.asarray(vertices, dtype=np.float64).reshape(-1)
     return ("v %.9g %.9g %.9g\n" * len(vertices)) % tuple(flat.tolist()) + faces

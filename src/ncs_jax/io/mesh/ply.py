@@ -30,9 +30,9 @@ class _Element:
 
 
 def read_ply(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
-    """The file, vertices (V, 3), faces (F, 3) int32 and the texture coordinates (V, 2) of its vertices, or None.
+    """Read a .ply: the file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2) or None.
 
-    Polygons are cut as `triangulate` says; edges and whatever else the file holds are passed over.
+    Polygons are cut as `triangulate` says. Edges and whatever else the file holds are ignored.
     """
     file = readable(path)
     if file.stat().st_size > LARGEST:
@@ -57,13 +57,13 @@ def read_ply(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray
             return file, x, np.zeros((0, 3), np.int32), uv
         corners = polygons[name]
         if corners.dtype.kind == "f" and (np.abs(corners) < 2**31).all() and (corners == np.floor(corners)).all():
-            corners = corners.astype(np.int64)  # a text does not show that they are whole
+            corners = corners.astype(np.int64)  # a text file does not say that they are whole numbers
         corners = indices(file, f"face.{name}", corners, ("N",), len(x), "vertices")
         return file, x, triangulate(file, x, lengths["face"], corners), uv
 
 
 def _header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:
-    """Byte order ("" for text), elements, and where the data begin."""
+    """Return the byte order ("" for text), the elements, and where the data begin."""
     end = data.find(b"end_header")
     stop = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
@@ -89,13 +89,13 @@ def _header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _element(e: _Element, source: _Words | _Bytes) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Properties by name, lists end to end, and how long the first list of every row is."""
+    """Return the properties of an element by name, lists end to end, and the length of every row's first list."""
     lists = [i for i, p in enumerate(e.properties) if p[2]]
     parts: list[list[np.ndarray]] = [[] for _ in e.properties]
     lengths = [np.zeros(0, np.int64)]
     done, block = 0, e.count if not lists else 1
     while done < e.count:
-        # Rows that follow each other mostly have lists of one length: as many as that are read at once.
+        # Neighbouring rows mostly have lists of the same length: such rows are read at once.
         begin, row = source.at, list[tuple[str, int]]()
         for _, kind, length in e.properties:
             size = int(source.take([(length, 1)], 1)[0][0, 0]) if length else 1
@@ -118,17 +118,17 @@ def _element(e: _Element, source: _Words | _Bytes) -> tuple[dict[str, np.ndarray
 
 
 class _Words:
-    """The numbers of a text, one after the other."""
+    """The numbers of a text file, taken one after the other."""
 
     def __init__(self, file: Path, words: list[bytes]) -> None:
         self.file, self.words, self.at = file, words, 0
 
     def left(self) -> int:
-        """How many are left."""
+        """Return how many numbers are left."""
         return len(self.words) - self.at
 
     def take(self, row: list[tuple[str, int]], rows: int) -> list[np.ndarray]:
-        """Columns (rows, size) of the next rows; each has a type, which a text does not show, and a size."""
+        """Return columns (rows, size) of the next rows; each has a type, which a text does not show, and a size."""
         sizes = [size for _, size in row]
         count = _enough(self.file, rows, sum(sizes), self.left(), "numbers")
         taken = np.fromiter(map(float, self.words[self.at : self.at + count]), np.float64, count).reshape(rows, sum(sizes))
@@ -137,17 +137,17 @@ class _Words:
 
 
 class _Bytes:
-    """Numbers in binary, one after the other."""
+    """The numbers of a binary file, taken one after the other."""
 
     def __init__(self, file: Path, data: bytes, at: int, order: str) -> None:
         self.file, self.data, self.at, self.order = file, data, at, order
 
     def left(self) -> int:
-        """How many bytes are left."""
+        """Return how many bytes are left."""
         return len(self.data) - self.at
 
     def take(self, row: list[tuple[str, int]], rows: int) -> list[np.ndarray]:
-        """Columns (rows, size) of the next rows; each has a type and a size."""
+        """Return columns (rows, size) of the next rows; each has a type and a size."""
         kind = np.dtype([(f"f{i}", self.order + k, (size,)) for i, (k, size) in enumerate(row)])
         count = _enough(self.file, rows, kind.itemsize, self.left(), "bytes")
         taken = np.frombuffer(self.data, kind, rows, self.at) if count else np.zeros(rows, kind)
@@ -156,6 +156,7 @@ class _Bytes:
 
 
 def _enough(file: Path, rows: int, width: int, left: int, what: str) -> int:
+    """Return rows times width, after a check that so much is left."""
     if rows < 0 or width < 0 or rows * width > left:
         raise InputError(
             f"{rows * width} {what} more expected, as the header says", file=file, field="data", value=f"{left} {what}",

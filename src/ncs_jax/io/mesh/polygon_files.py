@@ -14,7 +14,7 @@ __all__ = ["read_polygons"]
 
 
 def read_polygons(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
-    """The file, vertices (V, 3), faces (F, 3) and texture coordinates (V, 2) or None, of all its meshes as one."""
+    """Read all meshes of a file as one: the file, vertices (V, 3), faces (F, 3) and texture coordinates (V, 2) or None."""
     import trimesh
 
     file = readable(path)

@@ -13,10 +13,10 @@ __all__ = ["triangulate"]
 
 
 def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarray, skip: Collection[int] = ()) -> np.ndarray:
-    """Triangles (F, 3) int32 of polygons, in their order and each facing as its polygon does.
+    """Cut polygons into triangles (F, 3) int32, in their order and each facing as its polygon does.
 
-    A polygon is cut by a fan from its first corner where every triangle of it faces as the polygon's normal (Newell's); else
-    by one from its second corner; else ear by ear, as seen along the normal. One of no area becomes the fan that it is.
+    A polygon is cut by a fan from its first corner, if every triangle of the fan faces as the polygon's normal (Newell's); else
+    by one from its second corner; else ear by ear, seen along the normal. A polygon of no area is cut by a fan.
 
     Args:
         file: what an error names. x: (V, 3) vertices. counts: (P,) corners of each polygon. corners: (sum of counts,) vertices
@@ -47,13 +47,13 @@ def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarr
 
 
 def _equal(file: Path, x: np.ndarray, polygons: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Triangles (P, n - 2, 3) of polygons (P, n), whose numbers are for an error."""
+    """Cut polygons (P, n) of equally many corners into triangles (P, n - 2, 3); their numbers are for an error."""
     n = polygons.shape[1]
     fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
     if n == 3:
         return polygons[:, fan]
     places = x[polygons]
-    with np.errstate(all="ignore"):  # what is not finite is told of later
+    with np.errstate(all="ignore"):  # numbers that are not finite are reported later
         places = places - places[:, :1]
         normal = np.cross(places, np.roll(places, -1, axis=1)).sum(axis=1)  # twice the area
         area = np.linalg.norm(normal, axis=1)
@@ -74,7 +74,7 @@ def _equal(file: Path, x: np.ndarray, polygons: np.ndarray, number: np.ndarray) 
 
 
 def _ears(file: Path, x: np.ndarray, unit: np.ndarray, number: int) -> np.ndarray:
-    """Triangles (n - 2, 3) of one polygon (n, 3), the roundest ear first, so that none is a sliver that need not be."""
+    """Cut one polygon (n, 3) into triangles (n - 2, 3), the roundest ear first, to avoid slivers."""
     across = np.eye(3)[np.abs(unit).argmin()]
     u = np.cross(across, unit)
     flat = np.stack([x @ u, x @ np.cross(unit, u)], axis=1)
@@ -110,7 +110,7 @@ def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _holds(a: np.ndarray, b: np.ndarray, c: np.ndarray, points: np.ndarray) -> bool:
-    """Whether a point lies in the triangle or on its border, but at no corner, where the sides of a bridge to a hole meet."""
+    """Tell whether a point lies in the triangle or on its border, but at no corner, where a bridge to a hole may end."""
     points = points[(points != a).any(axis=1) & (points != b).any(axis=1) & (points != c).any(axis=1)]
     inside = (_cross(b - a, points - a) >= 0) & (_cross(c - b, points - b) >= 0) & (_cross(a - c, points - c) >= 0)
     return bool(inside.any())

@@ -1,4 +1,4 @@
-"""What makes triangles a cloth: an oriented manifold mesh without loose vertices; and what it is made of."""
+"""Checks that triangles are an oriented manifold without loose vertices, as cloth must be; its boundary and its parts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FLAT = 1e-6  # height of a triangle, of its longest edge, below which it is dege
 
 @dataclass(frozen=True)
 class SurfaceSummary:
-    """Connected components of a surface, loops of its boundary (its holes), and triangles so slim that they have no normal."""
+    """Numbers of a surface: connected components, loops of the boundary (holes), triangles too slim to have a normal."""
 
     components: int
     loops: int
@@ -24,7 +24,7 @@ class SurfaceSummary:
 
 
 def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
-    """Of vertices (V, 3) and triangles (F, 3) that `check_surface` has passed."""
+    """Count the components, holes and degenerate triangles of a surface that `check_surface` has passed."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -38,7 +38,7 @@ def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The loops of a surface's boundary, its holes: the vertices of each, in turn; the next edge is found around a vertex."""
+    """Return the loops of a surface's boundary, its holes: the vertices of each in turn."""
     edges = [tuple(e) for e in faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()]
     after = {e: edges[i + 1 - 3 * (i % 3 == 2)] for i, e in enumerate(edges)}  # the next edge in its triangle
     border = dict.fromkeys(e for e in edges if e[::-1] not in after)

@@ -29,7 +29,7 @@ USD = (".usd", ".usdc", ".usda", ".usdz")
 
 @dataclass(frozen=True, eq=False)
 class UsdMesh:
-    """Vertices (V, 3) in the stage's world, triangles (F, 3), metres a unit, and the axis that is up: "y" or "z"."""
+    """Vertices (V, 3) in the stage's world, triangles (F, 3), metres a unit, and the axis that is up, "x", "y" or "z"."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -41,10 +41,10 @@ class UsdMesh:
 
 
 def read_usd_mesh(path: str | Path) -> tuple[Path, UsdMesh]:
-    """All meshes of a file as one, at rest (the default time) or, where they only move, at their first time sample.
+    """Read all meshes of a file as one, at rest (the default time), or at the first time sample where there are only samples.
 
-    Transforms are applied, polygons become triangles, and the cage of a subdivision surface is taken as it is. Vertices keep
-    the file's order, mesh after mesh.
+    Transforms are applied and polygons become triangles. The cage of a subdivision surface is not subdivided. Vertices keep the
+    file's order, mesh after mesh.
     """
     file, table = _arrays(path, "still")
     x, faces = _joined(file, table)
@@ -52,7 +52,7 @@ def read_usd_mesh(path: str | Path) -> tuple[Path, UsdMesh]:
 
 
 def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, float]:
-    """The file, positions (T, V, 3) of every time sample in m and Y up, triangles (F, 3), and frames per second."""
+    """Read a moving mesh: the file, positions (T, V, 3) at every time sample, m, Y up, triangles (F, 3), frames per second."""
     file, table = _arrays(path, "moving")
     steps = np.diff(table["times"])
     if not len(table["times"]) or not np.allclose(steps, steps[:1], rtol=0.01):
@@ -66,7 +66,7 @@ def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, 
 
 
 def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
-    """What the program `usd_arrays` finds, which ends where the file makes it take more memory or time than is sane."""
+    """Return what the program `usd_arrays` finds; it is stopped where the file makes it take too much memory or time."""
     file = readable(path)
     _installed(file)
     size = file.stat().st_size
@@ -77,8 +77,8 @@ def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
         one = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "1"}  # each thread reserves memory
         done = subprocess.run(command, capture_output=True, timeout=seconds, check=False, env=one)
         if done.returncode:
-            said = done.stderr.decode(errors="replace").strip().splitlines()
-            raise OSError(said[-1] if done.returncode == 1 and said else "usd-core breaks off")
+            lines = done.stderr.decode(errors="replace").strip().splitlines()
+            raise OSError(lines[-1] if done.returncode == 1 and lines else "usd-core breaks off")
         with np.load(out, allow_pickle=False) as table:
             found = dict(table)
     if "0.points" not in found:
@@ -94,7 +94,7 @@ def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
 
 
 def _joined(file: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, V, 3) in the world and triangles (F, 3) of all meshes."""
+    """Return positions (T, V, 3) in the world and triangles (F, 3) of all meshes."""
     parts, faces, start = [], [], 0
     for i in range(sum(key.endswith(".points") for key in table)):
         name, turn = str(table[f"{i}.name"]), table[f"{i}.turn"]
@@ -150,15 +150,15 @@ def write_usd(path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: fl
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """What usd-core raises is an OSError of one line, and what it warns of is not printed."""
+    """Turn what usd-core raises into an OSError of one line, and keep its warnings from being printed."""
     from pxr import Tf, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
     except Tf.ErrorException as error:
-        said = str(error).strip().rsplit(" : '", 1)[-1].strip("'")
-        raise OSError(f"usd-core says {' '.join(said.split())[:200]}") from None
+        message = str(error).strip().rsplit(" : '", 1)[-1].strip("'")
+        raise OSError(f"usd-core says {' '.join(message.split())[:200]}") from None
     finally:
         delegate.TakeUncoalescedDiagnostics()
 

@@ -1,4 +1,4 @@
-"""Meshes of a USD file as plain arrays, by a program of its own: on a damaged file usd-core may crash or take all memory."""
+"""Meshes of a USD file as plain arrays, read by a separate program: on a damaged file usd-core may crash or take all memory."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ __all__ = ["arrays_of"]
 
 
 def arrays_of(path: str, moving: bool) -> dict[str, np.ndarray]:
-    """`scale`, `up`, `rate` and `times` of a stage; of mesh i `i.name`, `i.points` (times, V, 3), `i.turn` (times, 4, 4), by
-    which a point, as a row, gets into the world, `i.counts`, `i.corners`, `i.holes` and `i.left`, whether it is left-handed.
+    """Return a stage's arrays by name: `scale`, `up`, `rate` and `times`, and those of each mesh i.
 
-    Of a still stage there is one time: the default one, or the first time sample of a mesh that has only those.
+    These are `i.name`, `i.points` (times, V, 3), `i.turn` (times, 4, 4), which takes points, as rows, into the world,
+    `i.counts`, `i.corners`, `i.holes`, and `i.left`, whether the mesh is left-handed. A stage that is read as still has one
+    time: the default one, or the first time sample of a mesh that has only samples.
     """
     from pxr import Usd, UsdGeom
 
@@ -58,8 +59,8 @@ def _main(path: str, out: str, moving: str, memory: str) -> None:
     try:
         np.savez(out, allow_pickle=False, **arrays_of(path, moving == "moving"))
     except Exception as error:
-        said = str(error).strip().rsplit(" : '", 1)[-1].strip("'")  # usd-core's own words, without where in its source
-        sys.exit(f"\n{' '.join(said.split())[:200]}")
+        message = str(error).strip().rsplit(" : '", 1)[-1].strip("'")  # usd-core's own words, without where in its source
+        sys.exit(f"\n{' '.join(message.split())[:200]}")
 
 
 if __name__ == "__main__":

@@ -1,3 +1,3 @@
-"""Tables of arrays: .npz, .h5 and what all files have in common."""
+"""Named arrays in .npz and .h5, and what the reading and writing of all files has in common."""
 
 __all__: list[str] = []

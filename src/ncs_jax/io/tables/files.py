@@ -1,4 +1,4 @@
-"""Opening what is there and replacing what is finished: every failure of the file system becomes an InputError."""
+"""Opening files that are there, replacing files that are finished: every failure of the file system becomes an InputError."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ncs_jax.errors import InputError
 __all__ = ["LARGEST", "readable", "reading", "replacing", "text_of", "unpackable"]
 
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
-PACKING = 1100  # deflate packs at most 1032 to 1, so a header that promises more of its file is wrong
+PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
 
 
 def readable(path: str | Path) -> Path:
-    """The path of a regular file that is there, is not empty and may be read."""
+    """Return the path of a file. Raise an InputError unless it is a regular file, not empty, that may be read."""
     file = Path(path).expanduser()
     if file.is_dir():
         raise InputError("a file expected", file=file, value="a folder", mend="name a file in it")
@@ -36,7 +36,7 @@ def readable(path: str | Path) -> Path:
 
 @contextmanager
 def reading(file: Path, kind: str) -> Iterator[None]:
-    """Whatever a parser that is not ours raises on a broken file comes out as one InputError."""
+    """Turn whatever a foreign parser raises on a broken file into one InputError."""
     try:
         yield
     except InputError:
@@ -50,7 +50,7 @@ def reading(file: Path, kind: str) -> Iterator[None]:
 
 
 def text_of(path: str | Path) -> tuple[Path, str]:
-    """A text file whole; bytes that are not UTF-8 are replaced, as they can only stand in names and comments."""
+    """Read a whole text file. Bytes that are not UTF-8 are replaced: they can only stand in names and comments."""
     file = readable(path)
     size = file.stat().st_size
     if size > LARGEST // 4:
@@ -60,7 +60,7 @@ def text_of(path: str | Path) -> tuple[Path, str]:
 
 
 def unpackable(file: Path, field: str, size: int) -> None:
-    """Refuse an array that needs more memory than is allowed, or more than its file can hold however well packed."""
+    """Raise an InputError where an array needs more memory than is allowed, or more than its file can hold when packed."""
     if size > LARGEST:
         raise InputError(
             f"at most {LARGEST} bytes expected", file=file, field=field, value=f"{size} bytes", mend="split the file"
@@ -74,9 +74,9 @@ def unpackable(file: Path, field: str, size: int) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary sibling to write; it takes the place of `path` at once when all is written, and is removed when it is not.
+    """Give a temporary path beside `path` to write to; it takes the place of `path` once all is written, else it is removed.
 
-    Missing parent folders are made. A folder takes the place of a folder; its owner checks first what would be lost.
+    Missing parent folders are made. A folder may replace a folder: the caller first checks what would be lost.
     """
     file = Path(path).expanduser()
     if "\0" in str(file) or not file.name:

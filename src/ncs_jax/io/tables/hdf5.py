@@ -15,7 +15,7 @@ __all__ = ["read_hdf5", "write_hdf5"]
 
 
 def read_hdf5(path: str | Path, wanted: Callable[[str], bool]) -> Table:
-    """The datasets whose names are wanted; the others stay unread."""
+    """Read the datasets whose names are wanted; the others stay unread."""
     import h5py
 
     file = readable(path)

@@ -1,4 +1,4 @@
-"""NumPy's .npz: a zip of arrays. Nothing is unpickled, and no header is trusted with memory."""
+"""NumPy's .npz, a zip of arrays. Nothing is unpickled, and no header may claim more memory than its file can fill."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SUFFIX = ".npy"
 
 
 def read_npz(path: str | Path, wanted: Callable[[str], bool]) -> Table:
-    """The arrays whose names are wanted; the others stay unread."""
+    """Read the arrays whose names are wanted; the others stay unread."""
     file = readable(path)
     with reading(file, ".npz"), zipfile.ZipFile(file) as archive:
         members = {m.filename.removesuffix(SUFFIX): m for m in archive.infolist() if m.filename.endswith(SUFFIX)}

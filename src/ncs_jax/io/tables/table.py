@@ -1,4 +1,4 @@
-"""Named arrays of one file, taken out under checks of type, shape and finiteness."""
+"""Named arrays of one file; each is checked for type, shape and finite numbers when it is taken out."""
 
 from __future__ import annotations
 
@@ -36,11 +36,14 @@ def floats(
     first: int = 0,
     labels: list[str] | None = None,
 ) -> np.ndarray:
-    """A fresh float32 or float64 array of a shape (a letter is any size), all finite.
+    """Return a new float32 or float64 array, after a check that it has a shape (a letter is any size) and is finite.
 
     Args:
         file, field: what an error names. array: any numbers. axes: what the leading axes count, for the error ("frame",
-            "joint"). first: number of the first entry along the first axis. labels: of the entries along the second.
+            "joint"). first: number of the first entry along the first axis. labels: added to the numbers along the second.
+
+    Raises:
+        InputError: the array has another type or shape, or a number is not finite.
     """
     if array.dtype.kind not in "fiu":
         raise InputError("an array of numbers expected", file=file, field=field, value=str(array.dtype), mend="write floats")
@@ -63,7 +66,7 @@ def floats(
 
 
 def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int, what: str) -> np.ndarray:
-    """An int32 array of numbers from 0 to count - 1."""
+    """Return an int32 array, after a check that it has a shape and holds numbers from 0 to count - 1."""
     if array.dtype.kind not in "iu":
         raise InputError("whole numbers expected", file=file, field=field, value=str(array.dtype), mend="write int32")
     _check_shape(file, field, array, shape)
@@ -78,7 +81,7 @@ def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int,
 
 
 def shares(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
-    """Skinning weights (V, J) divided by their sums, which are 1 within 1e-3; none is negative."""
+    """Return skinning weights (V, J) divided by their sums, after a check: sums are 1 within 1e-3, no weight is negative."""
     low, sums = weights.min(axis=1, initial=0), weights.sum(axis=1, dtype=np.float64)
     for bad, text, value in (
         (low < -1e-6, "weights of 0 and above expected", low),
@@ -94,7 +97,7 @@ def shares(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
 
 
 def tree(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[str, ...] = ()) -> np.ndarray:
-    """The parent of each joint, (joints,) int32: one root, joint 0 with -1, and parents before their children."""
+    """Return the parent of each joint (joints,) int32, after a check: one root, joint 0 with -1, parents before children."""
     if array.dtype.kind not in "iu" or array.shape != (joints,):
         raise InputError(
             f"whole numbers of shape ({joints},) expected, one for each of the joints", file=file, field=field,
@@ -116,21 +119,21 @@ def tree(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[st
 
 
 def select(file: Path, frames: int, frame_range: tuple[int, int | None] | None) -> slice:
-    """Frames start to stop - 1 of a file; a stop of None is the end."""
+    """Return the slice of frames start to stop - 1, after a check that the file has them; a stop of None is the end."""
     if frame_range is None:
         return slice(0, frames)
     start, stop = frame_range[0], frames if frame_range[1] is None else frame_range[1]
     if not 0 <= start < stop <= frames:
         raise InputError(
             f"0 <= start < stop <= {frames} expected, the number of frames", file=file, field="frame_range",
-            value=(start, stop), mend="choose frames that the file has",
+            value=(start, stop), mend="choose frames that are in the file",
         )  # fmt: skip
     return slice(start, stop)
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Arrays by name. `names` is all that the file holds, also what was not read."""
+    """Arrays by name. `names` lists all that the file holds, also what was not read."""
 
     file: Path
     arrays: dict[str, np.ndarray]
@@ -140,7 +143,7 @@ class Table:
         return name in self.arrays
 
     def first(self, *aliases: str) -> str:
-        """The first of some names for one thing that the file has."""
+        """Return the first of some names for one thing that is in the file. Raise an InputError where none is."""
         for name in aliases:
             if name in self.arrays:
                 return name
@@ -149,19 +152,19 @@ class Table:
         raise InputError(f"missing{others}", file=self.file, field=aliases[0], mend=f"add it; the file holds {held}")
 
     def array(self, name: str) -> np.ndarray:
-        """An array as it was read."""
+        """Return an array as it was read."""
         return self.arrays[self.first(name)]
 
     def floats(self, name: str, shape: Shape, axes: tuple[str, ...] = ()) -> np.ndarray:
-        """See `floats`."""
+        """Return an array of finite numbers, see the function `floats`."""
         return floats(self.file, name, self.array(name), shape, axes)
 
     def indices(self, name: str, shape: Shape, count: int, what: str) -> np.ndarray:
-        """See `indices`."""
+        """Return an array of numbers from 0 to count - 1, see the function `indices`."""
         return indices(self.file, name, self.array(name), shape, count, what)
 
     def number(self, *aliases: str) -> float:
-        """One positive number, as a scalar or an array of one."""
+        """Return one positive number, which is written as a scalar or as an array of one."""
         name = self.first(*aliases)
         array = self.arrays[name]
         if array.dtype.kind not in "fiu" or array.size != 1 or not 0 < float(array.reshape(())) < np.inf:
@@ -172,7 +175,7 @@ class Table:
         return float(array.reshape(()))
 
     def joint_names(self, joints: int) -> tuple[str, ...]:
-        """The optional names of the joints: as many as there are, all different."""
+        """Return the names of the joints, as many as there are and all different; none where the file has no names."""
         if "joint_names" not in self:
             return ()
         array = self.arrays["joint_names"]
@@ -186,6 +189,6 @@ class Table:
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
             raise InputError(
-                "a name for each joint expected", file=self.file, field="joint_names", value=twice, mend="rename one"
+                "a different name for each joint expected", file=self.file, field="joint_names", value=twice, mend="rename one"
             )
         return names

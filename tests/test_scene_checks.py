@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ncs_jax.cli import main
-from ncs_jax.prepare.scene_checks import RANGES, findings
+from ncs_jax.prepare.scene_checks import RANGES, find_risks
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
 
@@ -25,7 +25,7 @@ def found(folder, text=SOUND, motion=None, cloth=None):
         np.savez(folder / "swing.npz", **motion)
     if cloth is not None:
         np.savez(folder / "cloth.npz", **cloth)
-    return findings(assemble(load_scene(path)))
+    return find_risks(assemble(load_scene(path)))
 
 
 @pytest.mark.slow
@@ -48,15 +48,15 @@ PHYSICS = {
 
 @pytest.mark.parametrize("what", PHYSICS)
 def test_material_out_of_range(tmp_path, plain_jax, what):
-    (finding,) = found(tmp_path, SOUND.replace("[network]", f"[physics]\n{PHYSICS[what]}\n[network]"))
-    assert finding.what == what and "safe" in finding.value and "physics" in finding.mend
+    (risk,) = found(tmp_path, SOUND.replace("[network]", f"[physics]\n{PHYSICS[what]}\n[network]"))
+    assert risk.what == what and "safe" in risk.value and "physics" in risk.mend
 
 
 def test_frame_rate_out_of_range(tmp_path, plain_jax):
     two = found(tmp_path, SCENE.replace("fps = 30", "fps = 1000"))
-    assert [finding.what for finding in two] == ["time step", "time step of a recurrence"] and "1/1000" in two[0].value
-    (finding,) = found(tmp_path, SCENE)
-    assert finding.what == "time step of a recurrence" and "swing" in finding.mend
+    assert [risk.what for risk in two] == ["time step", "time step of a recurrence"] and "1/1000" in two[0].value
+    (risk,) = found(tmp_path, SCENE)
+    assert risk.what == "time step of a recurrence" and "swing" in risk.mend
 
 
 def test_mesh_with_flaws(tmp_path, plain_jax):
@@ -69,12 +69,12 @@ def test_mesh_with_flaws(tmp_path, plain_jax):
     assert whats["height of a triangle"].value.startswith("1.0e-05 of its longest edge, 2 such")
 
 
-def test_motion_with_a_leap_and_a_flip(tmp_path, plain_jax):
+def test_motion_with_a_jump_and_a_flip(tmp_path, plain_jax):
     motion = swing()
     motion["trans"][12:, 0] += 2.0
     motion["poses"][15, -1, 0] += 3.0
     whats = {f.what: f for f in found(tmp_path, motion=motion)}
-    assert "frame 12" in whats["leap within a frame"].value and "2.0" in whats["leap within a frame"].value
+    assert "frame 12" in whats["jump within a frame"].value and "2.0" in whats["jump within a frame"].value
     assert "frame 1" in whats["turn within a frame"].value and "joint 1" in whats["turn within a frame"].value
 
 
@@ -92,7 +92,7 @@ AXES = {
     "stiffness": ("stiffness, times the default", 1.0, ["training, gated"]),
     "gravity": ("gravity, g", 9.81, ["training, gated"]),
     "size": ("size, times the default", 1.0, ["training, gated"]),
-    "way": ("from the origin, m", 1.0, ["training, gated"]),
+    "distance from the start": ("from the origin, m", 1.0, ["training, gated"]),
     "time step of a recurrence": ("time step, s", 1.0, []),
 }
 

@@ -1,0 +1,107 @@
+"""What is found out once from the files of a scene: skinning weights, touchable body, joints to read, smooth modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+from ncs_jax.geometry.laplacian_modes import modal_basis
+from ncs_jax.geometry.mesh import Mesh
+from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
+from ncs_jax.prepare.touchable import covered_by_layers, touchable_part
+from ncs_jax.scene.model import Layer
+from ncs_jax.scene.spec import Scene
+
+__all__ = ["Prepared", "SceneFiles", "prepare_scene"]
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files of a scene as read and checked against each other.
+
+    mesh: the garment's. pins: its pinned vertices (pins,). layers: the trained garments that are worn below it.
+    """
+
+    scene: Scene
+    body: io.BodyRecord | None
+    garment: io.GarmentRecord
+    mesh: Mesh
+    pins: np.ndarray
+    layers: tuple[Layer, ...]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What is found out once from the files of a scene and then kept with a run.
+
+    inputs: joints that the network reads, the root first. moves: whether the character ever moves. weights: the garment's
+    skinning weights (verts, joints). part: numbers of the body vertices that the garment can touch. basis: its smooth modes
+    (verts, modes), m. vibrations: the directions of a swing (verts, 3, modes), m. energy: of each of them, J. A scene whose
+    network does not swing has no vibrations.
+    """
+
+    inputs: np.ndarray
+    moves: np.ndarray
+    weights: np.ndarray
+    part: np.ndarray
+    basis: np.ndarray
+    vibrations: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 0), np.float32))
+    energy: np.ndarray = field(default_factory=lambda: np.zeros(()))
+
+
+def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prepared:
+    """Return what the files and the training motions of a scene tell, vibrations aside."""
+    scene, body, garment = files.scene, files.body, files.garment
+    moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in motions)
+    basis = _smooth_modes(files)
+    if body is None:
+        weights = np.ones((len(garment.vertices), 1), np.float32)
+        return Prepared(np.zeros(1, np.int64), np.asarray(moves), weights, np.zeros(0, np.int64), basis)
+    weights = garment.weights
+    if weights is None:
+        weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+        weights = smooth_weights(weights, np.asarray(files.mesh.edges), scene.garment.smoothing)
+    part = np.zeros(0, np.int64)
+    if scene.physics.collision.stiffness > 0:
+        part = touchable_part(scene, body, garment, weights, motions)
+        if files.layers:
+            part = part[~covered_by_layers(body, files.layers)[part]]
+    wanted = used_joints(body.parents.tolist(), np.concatenate([weights, body.weights[part]]))
+    if moves:  # a joint that never turns tells the network nothing
+        turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in motions], axis=0)
+        wanted = tuple(j for j in wanted if turning[j] or body.parents[j] < 0)
+    inputs = _input_joints(scene, body, wanted)
+    return Prepared(np.asarray(inputs), np.asarray(moves), weights.astype(np.float32), part, basis)
+
+
+def _smooth_modes(files: SceneFiles) -> np.ndarray:
+    """Return the garment's smooth modes (verts, modes), m, zero at pins that hold."""
+    scene, garment = files.scene, files.garment
+    if not scene.network.modes:
+        return np.zeros((len(garment.vertices), 0), np.float32)
+    held = files.pins if scene.physics.pinning.stiffness > 0 else ()
+    area = np.asarray(files.mesh.vertex_area)
+    return modal_basis(garment.vertices, garment.faces, area, scene.network.modes, held=held)
+
+
+def _input_joints(scene: Scene, body: io.BodyRecord, default: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the joints that the network reads, the root first: those of `body.joints`, or the default where it is empty."""
+    if not scene.body.joints:
+        return default
+    names = {n: i for i, n in enumerate(body.joint_names)}
+    chosen = []
+    for i, name in enumerate(scene.body.joints):
+        number = names.get(name, int(name) if name.isdigit() else -1)
+        if not 0 <= number < len(body.parents):
+            valid = ", ".join(names) if names else f"numbers 0 to {len(body.parents) - 1}"
+            raise InputError(
+                "no such joint in the body", file=scene.source, field=f"body.joints[{i}]", value=name,
+                mend=f"choose from {valid}",
+            )  # fmt: skip
+        chosen.append(number)
+    root = int(np.flatnonzero(body.parents < 0)[0])
+    return (root, *sorted(set(chosen) - {root}))
