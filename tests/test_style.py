@@ -40,7 +40,6 @@ LONG_FUNCTIONS: dict[str, str] = {
     "io.character.rig.rig_from": "to be divided",
     "prepare.build._model": "to be divided",
     "prepare.retarget.retarget": "to be divided",
-    "runs.train.train": "to be divided",
     "simulation.solver.cholesky._symbolic": "to be divided",
     "training.loss.gradients": "to be divided",
     "view.rasteriser._rasterise": "to be divided",

@@ -131,9 +131,7 @@ def load_run(folder: str | Path) -> Run:
     if step is None:
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
-    params = checkpoints.restore(like).params
-    checkpoints.close()
-    return Run(assembly, params, step)
+    return Run(assembly, checkpoints.restore(like).params, step)
 
 
 def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float32) -> Assembly:
