@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -249,14 +250,29 @@ def test_hosts_that_cannot_be_joined(capsys):
     one_line(capsys, ["--hosts", "in use", "free port"])
 
 
-@pytest.mark.parametrize("command", ["demo", "train", "animate", "evaluate", "check"])
+COMMANDS = ("demo", "train", "animate", "export", "simulate", "evaluate", "view", "fit", "check")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_every_option(capsys, command):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    options = [line for line in text.split("options:")[1].splitlines() if line.startswith("  --")]
-    assert all(len(line.split()) > 2 or text.splitlines()[text.splitlines().index(line) + 1].strip() for line in options)
+    options = re.split(r"\n  (?=-)", text.split("\noptions:")[1])[1:]
+    assert options[0].startswith("-h, --help") and len(options) > 1
+    for option in options:  # its name and value, then two spaces or a line's end, then what it is for
+        assert re.search(r"^\S.*?(  +|\n +)\S.*\w", option), option
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    overview, table = text.split("positional arguments:")
+    told = re.findall(r"^    (\w+)  +\w", table, re.MULTILINE)
+    assert tuple(re.findall(r"^  ncs (\w+) ", overview, re.MULTILINE)) == COMMANDS and sorted(told) == sorted(COMMANDS)
 
 
 def test_check_says_what_is_in_a_scene(tmp_path, capsys):

@@ -90,6 +90,16 @@ def test_alpha_is_for_ncs_alone(tmp_path):
         assert (apart > 1e-4) == assembly.network.controlled == (method in ("ncs", "swing"))
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_only_a_swing_tells_the_motions_anything(tmp_path, method):
+    assembly, params, motion = ready(tmp_path, method=method)
+    features = features_from_records(assembly.model, motion)
+    told = jax.eval_shape(lambda f: jax.tree.leaves(assembly.network.refresh(params, assembly.model, f)), features)
+    more = [leaf.shape for leaf in told[len(jax.tree.leaves(features)) :]]
+    assert bool(more) == assembly.network.refreshes == (method == "swing")
+    assert not more or more == [(len(motion.poses), assembly.network.modes)]
+
+
 def test_snug_sees_the_roots_motion(tmp_path):
     assembly, params, motion = ready(tmp_path, method="snug")
     t = np.arange(len(motion.poses))

@@ -2,10 +2,12 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import jax
@@ -14,9 +16,12 @@ import pytest
 
 from ncs_jax.errors import InputError
 from ncs_jax.network.rollout import stepper
+from ncs_jax.runs.checkpoint import Checkpoints, write_run
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
+from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.devices import free_memory
+from ncs_jax.training.step import initial_state
 
 from .scenes import write_scene
 
@@ -128,6 +133,67 @@ def test_a_run_is_not_overwritten(tmp_path, plain_jax):
     assert run.steps == 10
     vertices = run.animate(str(tmp_path / "swing.npz"), alpha=1)
     assert vertices.shape == (24, 30, 3) and np.isfinite(vertices).all()
+
+
+def test_a_checkpoint_of_orbax_0_is_read_and_gone_on_with(tmp_path, plain_jax):
+    """Runs of version 0.1 were written so: with the first of Orbax's two APIs, and its own folder of checkpoints."""
+    import orbax.checkpoint as orbax_0
+
+    scene, out = write_scene(tmp_path), tmp_path / "run"
+    whole = train(scene, out, steps=20)
+    folder = out / "checkpoints"
+    assert sorted(p.name for p in folder.iterdir()) == ["10", "20"]
+    shutil.rmtree(folder / "20")
+    state = Checkpoints(out).restore(initial_state(whole.assembly.model, whole.assembly.network, 0))
+    assert int(state.step) == 10
+    shutil.rmtree(folder / "10")
+    options = orbax_0.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False, create=False)
+    with orbax_0.CheckpointManager(folder, options=options) as manager:
+        manager.save(10, args=orbax_0.args.StandardSave(jax.tree.map(np.asarray, state)))
+    assert (folder / "10" / "default").is_dir()
+    old = load_run(out)
+    assert old.steps == 10 and all(map(np.array_equal, jax.tree.leaves(old.params), jax.tree.leaves(state.params)))
+    resumed = train(scene, out, resume=True)
+    assert all(map(np.array_equal, jax.tree.leaves(resumed.params), jax.tree.leaves(whole.params)))
+
+
+def test_two_checkpoints_are_kept_and_what_a_kill_left_is_removed(tmp_path, plain_jax):
+    checkpoints, folder = Checkpoints(tmp_path), tmp_path / "checkpoints"
+    assert checkpoints.latest() is None
+    (folder / "9.orbax-checkpoint-tmp").mkdir()
+    (folder / "9.orbax-checkpoint-tmp" / "half").write_text("")
+    for step in (9, 10, 100):
+        checkpoints.save(step, {"a": np.full(3, step, np.float32)})
+        assert checkpoints.latest() == step
+    assert sorted(p.name for p in folder.iterdir()) == ["10", "100"]
+    like = {"a": jax.ShapeDtypeStruct((3,), np.float32)}
+    np.testing.assert_array_equal(checkpoints.restore(like)["a"], np.full(3, 100))
+    with pytest.raises(InputError, match=r"100: the checkpoint cannot be read: .*shape"):
+        checkpoints.restore({"a": jax.ShapeDtypeStruct((4,), np.float32)})
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_reading_a_checkpoint_gives_pythons_hook_back(tmp_path, plain_jax, monkeypatch, damaged):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"a": np.ones(3, np.float32)})
+    if damaged:
+        shutil.rmtree(tmp_path / "checkpoints" / "1" / "default")
+
+    def hook(what):
+        raise AssertionError(what)
+
+    monkeypatch.setattr(sys, "unraisablehook", hook)
+    with pytest.raises(InputError, match="cannot be read") if damaged else nullcontext():
+        checkpoints.restore({"a": jax.ShapeDtypeStruct((3,), np.float32)})
+    assert sys.unraisablehook is hook
+
+
+def test_killed_before_anything_was_prepared_a_run_goes_on(tmp_path, plain_jax):
+    """Between its first two files: run.json is there, prepared.npz is not."""
+    scene, out = write_scene(tmp_path), tmp_path / "run"
+    write_run(out, {"steps": 0, "seed": 0, "scene": load_scene(scene).to_dict()})
+    train(scene, out, steps=10, resume=True)
+    assert load_run(out).steps == 10
 
 
 def test_minutes_choose_the_steps(tmp_path, plain_jax):

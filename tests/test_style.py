@@ -36,17 +36,8 @@ NUMERIC = {"geometry", "energies", "scene", "network", "simulation", "metrics", 
 DRAWS = {"view"}
 
 LONG_MODULES: dict[str, str] = {}  # over 450 lines, and why
-LONG_FUNCTIONS: dict[str, str] = {
-    "runs.train.train": "to be divided",
-    "simulation.solver.cholesky._symbolic": "to be divided",
-    "training.loss.gradients": "to be divided",
-}  # over 60 lines, and why
-MANY_PARAMETERS: dict[str, str] = {
-    "energies.contact.nearest._search": "to be divided",
-    "metrics.quality._frame": "to be divided",
-    "training.loss.gradients": "to be divided",
-    "training.step.step": "to be divided",
-}  # over 7, and why
+LONG_FUNCTIONS: dict[str, str] = {}  # over 60 lines, and why
+MANY_PARAMETERS: dict[str, str] = {}  # over 7, and why
 
 
 def tree(path: Path) -> ast.Module:

@@ -1,4 +1,4 @@
-"""What the options of all commands have in common: how one is declared, and the types of their values."""
+"""Declare commands, and read the values of their options."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def finite(text: str) -> float:
 
 
 def hosts(text: str) -> dict:
-    """Arguments of `jax.distributed.initialize`."""
+    """Return the arguments of `jax.distributed.initialize`, none for `auto`."""
     if text == "auto":
         return {}
     found = re.fullmatch(r"(.+):(\d+),(\d+),(\d+)", text)

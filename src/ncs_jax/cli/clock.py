@@ -1,4 +1,4 @@
-"""Times as a person reads them."""
+"""Write times as a person reads them."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def add_commands(commands) -> None:
 
 
 def evaluate(options) -> int:
-    """`ncs evaluate`: how an animation does and how it moves, in physical units."""
+    """Print how an animation does and how it moves, in physical units."""
     from ncs_jax.metrics.motion import MEASURES, compare_motion, measure_motion
     from ncs_jax.metrics.quality import QUANTITIES, measure, summarise
     from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over

@@ -28,7 +28,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; the exit code is 0, or 2 for input that cannot be used, or 130 when interrupted."""
+    """Run a command, and return its exit code: 0, 2 for input that cannot be used, or 130 when interrupted."""
     parsed = _parser().parse_args(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
     _keep_compiled_programs()
@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _keep_compiled_programs() -> None:
-    """A second run need not compile again; JAX_COMPILATION_CACHE_DIR, if set, says where."""
+    """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR if that is set."""
     import jax
 
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):

@@ -9,6 +9,7 @@ from pathlib import Path
 from ncs_jax.cli import arguments
 from ncs_jax.cli.clock import clock
 from ncs_jax.errors import InputError
+from ncs_jax.runs.log import Report
 from ncs_jax.scene.spec import PRESETS, load_scene
 
 __all__ = ["add_commands", "demo", "leave", "train"]
@@ -41,13 +42,17 @@ def train(options) -> int:
     """Train the garment of a scene, perhaps with other hosts."""
     import jax
 
+    from ncs_jax.runs import train as runs_train
+
     if options.preset and options.resume:
         raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
     scene = load_scene(options.scene, options.preset)
     if options.hosts is not None:
         _join(options.hosts)
     try:
-        run = _trained(scene, options.out, options.steps, options.minutes, options.seed, options.resume)
+        chosen = {name: getattr(options, name) for name in ("steps", "minutes", "seed", "resume")}
+        with _TrainingBar() as bar:
+            run = runs_train.train(scene, options.out, **chosen, report=bar.show)
     except jax.errors.JaxRuntimeError as error:
         if options.hosts is None:
             raise
@@ -63,9 +68,12 @@ def train(options) -> int:
 
 def demo(options) -> int:
     """Train the packaged T-shirt, draw it and print how it does on a motion that it never saw."""
+    from ncs_jax.runs import train as runs_train
+
     out = Path(options.out)
     resume = (out / "run.json").exists()
-    run = _trained(options.scene, out, None, options.minutes, None, resume)
+    with _TrainingBar() as bar:
+        run = runs_train.train(options.scene, out, minutes=options.minutes, resume=resume, report=bar.show)
     quantities = _previews(run, out)
     motion = run.assembly.scene.motion.validation
     print(f"On {motion[0] if motion else 'its own motion'}, which it never trained on:" if motion else "On its motion:")
@@ -74,6 +82,7 @@ def demo(options) -> int:
 
 
 def _previews(run, out) -> dict[str, float]:
+    """Draw the run into its folder, print which files there are, and return how it does on its motion."""
     from ncs_jax.view.preview import preview
 
     print("drawing the preview ...", flush=True)
@@ -84,45 +93,48 @@ def _previews(run, out) -> dict[str, float]:
     return quantities
 
 
-def _trained(scene, out, steps, minutes, seed, resume):
-    import jax
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+class _TrainingBar:
+    """A bar that says how training goes; lines instead where the output is no terminal. Only the first process shows it."""
 
-    from ncs_jax.runs import train as runs_train
+    def __init__(self) -> None:
+        import jax
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    console = Console(quiet=jax.process_index() > 0)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=None),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console, transient=False) as progress:
-        task = progress.add_task("reading the scene and compiling", total=None)
+        self._console = Console(quiet=jax.process_index() > 0)
+        percent = TextColumn("{task.percentage:>3.0f}%")
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), percent, TimeElapsedColumn())
+        self._progress = Progress(*columns, console=self._console, transient=False)
+        self._task = self._progress.add_task("reading the scene and compiling", total=None)
+        self._devices = jax.device_count()
 
-        def show(r):
-            if jax.device_count() > 1 and progress.tasks[0].total is None:  # the first report
-                fewer = "" if r.devices == jax.device_count() else ": no more of them divide training.batch"
-                progress.print(f"training on {r.devices} of {jax.device_count()} devices{fewer}")
-            parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
-            text = (
-                f"step {r.step}/{r.steps}  [bold]{sum(r.energies.values()):.4f} J[/bold]  ({parts})\n"
-                f"strain {r.strain:.1f} %  penetrating {r.penetrating:.1f} %  {clock(r.left)} left"
-                + ("" if r.moved is None else f"  alpha moves {r.moved:.1f} mm")
-                + (f"  dropped {r.dropped}" if r.dropped else "")
-            )
-            progress.update(task, total=r.steps, completed=r.step, description=text)
-            if r.message:
-                progress.print(r.message)
-            if r.validation:
-                words = ", ".join(f"{k} {v:.4g}" for k, v in r.validation.items())
-                progress.print(f"step {r.step}: validation {words}")
-            if not console.is_terminal and (r.step % 100 == 0 or r.step == r.steps):
-                print(f"step {r.step}/{r.steps} total {sum(r.energies.values()):.4f} {parts} strain {r.strain:.1f} %"
-                      f" penetrating {r.penetrating:.1f} % {clock(r.left)} left", flush=True)  # fmt: skip
+    def __enter__(self) -> _TrainingBar:
+        self._progress.start()
+        return self
 
-        return runs_train.train(scene, out, steps=steps, minutes=minutes, seed=seed, resume=resume, report=show)
+    def __exit__(self, *_) -> None:
+        self._progress.stop()
+
+    def show(self, r: Report) -> None:
+        """Show a report."""
+        if self._devices > 1 and self._progress.tasks[0].total is None:  # the first report
+            fewer = "" if r.devices == self._devices else ": no more of them divide training.batch"
+            self._progress.print(f"training on {r.devices} of {self._devices} devices{fewer}")
+        total = sum(r.energies.values())
+        parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
+        moved = "" if r.moved is None else f"  alpha moves {r.moved:.1f} mm"
+        dropped = f"  dropped {r.dropped}" if r.dropped else ""
+        text = f"step {r.step}/{r.steps}  [bold]{total:.4f} J[/bold]  ({parts})\n"
+        text += f"strain {r.strain:.1f} %  penetrating {r.penetrating:.1f} %  {clock(r.left)} left{moved}{dropped}"
+        self._progress.update(self._task, total=r.steps, completed=r.step, description=text)
+        if r.message:
+            self._progress.print(r.message)
+        if r.validation:
+            words = ", ".join(f"{k} {v:.4g}" for k, v in r.validation.items())
+            self._progress.print(f"step {r.step}: validation {words}")
+        if not self._console.is_terminal and (r.step % 100 == 0 or r.step == r.steps):
+            where = f"step {r.step}/{r.steps} total {total:.4f} {parts} strain {r.strain:.1f} %"
+            print(f"{where} penetrating {r.penetrating:.1f} % {clock(r.left)} left", flush=True)
 
 
 def _join(hosts: dict) -> None:

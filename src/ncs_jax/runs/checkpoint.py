@@ -1,7 +1,7 @@
-"""Run folders: Orbax checkpoints, and the JSON that rebuilds everything else.
+"""Read and write run folders: Orbax checkpoints, and the JSON that rebuilds everything else.
 
     RUN/run.json                the scene, the steps planned, the seed, the versions
-    RUN/prepared.npz            what was found out from the scene's files: skinning weights, touchable part, modes
+    RUN/prepared.npz            what was computed from the scene's files: skinning weights, touchable part, modes
     RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
     RUN/log.csv                 one row a report
 
@@ -10,9 +10,11 @@ Every write goes to a temporary name first and is renamed when complete, so a ki
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,9 +28,13 @@ from ncs_jax.prepare.prepared import Prepared
 
 __all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
 
+KEPT = 2  # checkpoints
+NAME = "default"  # what Orbax calls the one thing in a checkpoint: so its version 0 did, and each reads what the other wrote
+TEMPORARY = ".orbax-checkpoint-tmp"
+
 
 def check_writable(run: Path) -> None:
-    """See, before anything is worked out, that a run folder can be made.
+    """Check, before anything is computed, that a run folder can be made.
 
     Raises:
         InputError: it cannot.
@@ -98,21 +104,14 @@ def read_prepared(run: Path) -> Prepared:
 
 
 class Checkpoints:
-    """The checkpoints of one run. Orbax writes each into a temporary folder and renames it when it is whole."""
+    """The checkpoints of one run, a folder for each, named by its step; the newest `KEPT` are kept.
+
+    Orbax writes each into a temporary folder and renames it when it is whole. Only one process writes, and no other waits.
+    """
 
     def __init__(self, run: Path):
-        import orbax.checkpoint as ocp
-
-        here = jax.process_index()  # whichever process this is, it waits for no other
-        alone = ocp.options.MultiprocessingOptions(here, active_processes={here}, barrier_sync_key_prefix=f"process {here}")
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=2, enable_async_checkpointing=False, cleanup_tmp_directories=True, create=False,
-            multiprocessing_options=alone,
-        )  # fmt: skip
         self._folder = (Path(run) / "checkpoints").absolute()
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._manager = ocp.CheckpointManager(self._folder, options=options)
-        self._args = ocp.args
 
     def save(self, step: int, state: Any) -> None:
         """Write the state after `step` steps.
@@ -120,10 +119,13 @@ class Checkpoints:
         Raises:
             InputError: the disk is full, or the folder is gone.
         """
+        ocp = _orbax()
         try:
-            # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
-            self._manager.save(step, args=self._args.StandardSave(jax.tree.map(np.asarray, state)))
-            self._manager.wait_until_finished()
+            with _alone(ocp):
+                # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
+                arrays = jax.tree.map(np.asarray, state)
+                ocp.save(self._folder / str(step), arrays, checkpointable_name=NAME)
+            self._tidy()
         except OSError as error:
             reason = error.strerror or str(error)
             mend = "make room and go on with --resume; the checkpoint before this one is whole"
@@ -132,28 +134,61 @@ class Checkpoints:
             ) from None
 
     def latest(self) -> int | None:
-        """The newest whole checkpoint's step."""
-        return self._manager.latest_step()
+        """Return the step of the newest whole checkpoint, None where there is none."""
+        return max(self._steps(), default=None)
 
     def restore(self, like: Any) -> Any:
-        """The newest state, with the shapes and types of `like`.
+        """Return the newest state, with the shapes and types of `like`, on this process's first device.
 
         Raises:
             InputError: it is damaged, or of another network.
         """
-        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), like)
-        step = self.latest()
-        # Where one array is damaged, the others, still being read, complain one by one that nobody waits for them.
-        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        ocp, folder = _orbax(), self._folder / str(self.latest())
+        here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=here), like)
         try:
-            state = self._manager.restore(step, args=self._args.StandardRestore(shapes))
+            with _alone(ocp), _quiet():
+                return ocp.load(folder, shapes, checkpointable_name=NAME)
         except Exception as error:  # Orbax and its store have no common error class
             reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
             mend = "delete this folder to go back to the checkpoint before it"
-            raise InputError(f"the checkpoint cannot be read: {reason}", file=self._folder / str(step), mend=mend) from error
-        sys.unraisablehook = hook
-        return jax.device_put(state)
+            raise InputError(f"the checkpoint cannot be read: {reason}", file=folder, mend=mend) from error
 
-    def close(self) -> None:
-        """Wait for pending writes."""
-        self._manager.close()
+    def _steps(self) -> list[int]:
+        return sorted(int(p.name) for p in self._folder.iterdir() if p.name.isdigit())
+
+    def _tidy(self) -> None:
+        """Remove what a kill left half written, and all but the newest checkpoints."""
+        for step in self._steps()[:-KEPT]:
+            # First out of the way: a kill while it is removed leaves no half of a checkpoint under its name.
+            (self._folder / str(step)).rename(self._folder / f"{step}{TEMPORARY}")
+        for left in self._folder.glob(f"*{TEMPORARY}"):
+            shutil.rmtree(left)
+
+
+def _orbax():
+    """Return Orbax's API, version 1, which is about to move out of `experimental`."""
+    try:
+        from orbax.checkpoint import v1 as ocp
+    except ImportError:
+        from orbax.checkpoint.experimental import v1 as ocp
+    return ocp
+
+
+def _alone(ocp):
+    """Return a context in which Orbax has this process, whichever it is, wait for no other."""
+    context, here = ocp.Context(), jax.process_index()
+    context.multiprocessing.primary_host = here
+    context.multiprocessing.active_processes = {here}
+    context.multiprocessing.barrier_sync_key_prefix = f"process {here}"
+    return context
+
+
+@contextlib.contextmanager
+def _quiet():
+    """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook

@@ -1,4 +1,4 @@
-"""The log of a run: a CSV table, and TensorBoard's events."""
+"""Write the log of a run: a CSV table, and TensorBoard's events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trained garment: load it from its run folder, animate, measure, export."""
+"""Open a trained garment from its run folder; animate, measure and export it."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Run:
     steps: int = 0
 
     def track(self, motion: str) -> MotionFeatures:
-        """A motion file, `ncs:NAME` or a motion as the scene names it, ready to animate."""
+        """Return a motion, ready to animate: a file, `ncs:NAME`, or one as the scene names it."""
         return features_from_records(self.assembly.model, self.motion(motion))
 
     def motion(self, name: str) -> io.MotionRecord:
-        """A motion at the scene's frame rate; a path that the scene does not name is taken from the current folder."""
+        """Return a motion at the scene's frame rate; a path that the scene does not name is taken from the current folder."""
         a = self.assembly
         if name in a.motions:
             return a.motions[name]
@@ -49,7 +49,7 @@ class Run:
         return load_motion(a.scene, name if known else str(Path(name).absolute()), a.body)
 
     def animate(self, motion: str | MotionFeatures, alpha: float = 1.0) -> np.ndarray:
-        """Garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
+        """Return garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
 
         Raises:
             InputError: a vertex is not finite: where, and what was so first.
@@ -66,7 +66,7 @@ class Run:
         return x
 
     def compressed(self, motion: str | MotionFeatures, *, rank: int = 0, bfloat16: bool = False) -> Run:
-        """This garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.
+        """Return this garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.
 
         Raises:
             InputError: the motion has no such rank.
@@ -109,7 +109,7 @@ class Run:
         )
 
     def evaluate(self, motion: str | MotionFeatures, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
-        """Physical quantities per frame, see `evaluation.QUANTITIES` and `evaluation.measure`."""
+        """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
         track = self.track(motion) if isinstance(motion, str) else motion
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
 
@@ -131,9 +131,7 @@ def load_run(folder: str | Path) -> Run:
     if step is None:
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
-    params = checkpoints.restore(like).params
-    checkpoints.close()
-    return Run(assembly, params, step)
+    return Run(assembly, checkpoints.restore(like).params, step)
 
 
 def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float32) -> Assembly:

@@ -65,7 +65,7 @@ class Trajectory:
 
 @jax.jit
 def _turned(model: Model, turn) -> Array:
-    """The gradient, N, of stretch, bending and pins of a garment that is only turned: rounding and nothing else."""
+    """Return the gradient, N, of stretch, bending and pins of a garment that is only turned: rounding and nothing else."""
     garment, rest = model.garment, model.garment.mesh.rest
     blended = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
     terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False)
@@ -79,11 +79,11 @@ def _turned(model: Model, turn) -> Array:
 
 
 def rounding(model: Model) -> float:
-    """About what rounding leaves out of balance in the precision of a model, as a `Solution`'s residual, in g.
+    """Estimate what rounding leaves out of balance in the precision of a model, as a `Solution`'s residual, in g.
 
-    Positions are rounded to a share of their distance from the root, and cloth that is stiff for its weight answers with
-    accelerations: here their mass-weighted r.m.s. where the garment is only turned, and nothing strains. Of what a simulation
-    cannot go below it is 0.9 to 3.3 times as much (`experiments.stability`).
+    Positions are rounded to a share of their distance from the root. Cloth that is stiff for its weight answers with
+    accelerations. Their mass-weighted r.m.s. is returned, for a garment that is only turned, so that nothing strains. It is
+    0.9 to 3.3 times the residual that a simulation cannot go below (`experiments.stability`).
     """
     turn = jnp.asarray(Rotation.from_rotvec(TURN).as_matrix(), model.basis.dtype)
     gradient = np.asarray(_turned(model, turn), np.float64)
@@ -194,7 +194,7 @@ def _kept(state: SimulationState) -> dict[str, np.ndarray]:
 
 
 def _continued(partial: Path, identity: str, like: dict[str, np.ndarray], start: SimulationState):
-    """The frames that are done, and the state to go on from."""
+    """Return the frames that are done, and the state to go on from."""
     table = read_npz(partial, {*like, *KEPT, "identity"}.__contains__)
     if str(table.array("identity")) != identity:
         raise InputError(

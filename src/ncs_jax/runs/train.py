@@ -6,36 +6,29 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.errors import InputError
 from ncs_jax.metrics.quality import summarise
-from ncs_jax.network.methods.swing import Swing
-from ncs_jax.network.rollout import animate
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
+from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.run import Run, assemble
-from ncs_jax.scene.model import pose_body
 from ncs_jax.scene.spec import Scene, load_scene, scene_from
-from ncs_jax.training.batches import CHUNK, batches, chunks
-from ncs_jax.training.devices import batch_mesh, compiled, copied, divided, give_back, local
-from ncs_jax.training.loss import with_bodies
-from ncs_jax.training.metrics import diagnose, training_metrics
-from ncs_jax.training.step import chunk_runner, initial_state
+from ncs_jax.training.batches import CHUNK, chunks
+from ncs_jax.training.devices import give_back
+from ncs_jax.training.step import TrainState
 
 __all__ = ["train"]
 
 
 IDLE = 0.5  # mm that alpha should make a difference of, at least
-LOOKED = 64  # poses that the search for contacts is prepared for,
-EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, and with every checkpoint
+EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
 
 
 def train(
@@ -60,163 +53,213 @@ def train(
     Raises:
         InputError: the scene or the folder is unusable, or the hosts do not divide the batch.
     """
-    scene = load_scene(scene) if isinstance(scene, str | Path) else scene
-    began = time.monotonic()
+    scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
     out = None if out is None else Path(out)
-    facts = None
-    if out is not None and (out / "run.json").exists():
-        if not resume:
-            raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
-        facts = read_run(out)
-        scene = scene_from(facts["scene"], source=str(out / "run.json"))
-    elif resume:
-        raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
+    facts = _facts(out, resume)
+    if facts is not None:
+        scene, seed = scene_from(facts["scene"], source=str(out / "run.json")), facts["seed"]
     if out is not None:
         check_writable(out)
     assembly = assemble(scene)
     give_back()
-    spec, model, network, track = scene.training, assembly.model, assembly.network, assembly.track
-    seed = (spec.seed if seed is None else seed) if facts is None else facts["seed"]
-    mesh = batch_mesh(spec.batch)
-    run_chunk = chunk_runner(network, spec, mesh)
-    everywhere = copied(mesh, (model, with_bodies(model, track, spec.batch)))
-    # That waited for every process: from here on, one may write.
-    if jax.process_index() > 0:
+    placed = PlacedScene(assembly, scene.training.seed if seed is None else seed)
+    if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
-    look = jax.jit(lambda model, params, track, ends: training_metrics(model, network, spec.window, params, track, ends))
-    frames = track.start.shape[0]
-    placed = jax.jit(lambda m, p, t: (animate(m, network, p, t, None), jax.vmap(lambda at: pose_body(m, at))(t.matrices)))
-    motions, swings = track, jax.jit(network.swings) if isinstance(network, Swing) else None
-
-    def look_at_swings(params):
-        """Tell the motions what swings the network gives now, if it has any."""
-        nonlocal track, everywhere
-        if swings is not None:
-            q = swings(params, model, motions)
-            track, everywhere = replace(track, swing=q), (everywhere[0], replace(everywhere[1], swing=copied(mesh, q)))
-
-    def look_at_contacts(params):
-        """Tell the search for the nearest vertex where the garment is now: what it finds is the same, several times as fast."""
-        nonlocal model, everywhere
-        if model.terms.collision == "plane" and model.terms.exact:
-            some = np.unique(np.linspace(0, frames - 1, LOOKED).astype(int))
-            part = replace(jax.tree.map(lambda a: a[some], motions), origin=None)
-            cloth, body = map(np.asarray, placed(model, params, part))
-            model = replace(model, surface=rebuild_lists(model.surface, list(zip(cloth, body, strict=True))))
-            everywhere = (copied(mesh, model), everywhere[1])
-
-    def indices(first, count):
-        ends = batches(frames, spec.batch, seed, first, count)
-        pairs = np.stack([np.random.default_rng([seed, 1, s]).permutation(spec.batch) for s in range(first, first + count)])
-        return ends, pairs.astype(np.int32)
-
-    programs: dict[int, Callable] = {}
-
-    def prepared(first, count, state, steps):
-        """A chunk's arguments, its program compiled."""
-        arguments = (state, *divided(mesh, indices(first, count)), steps, *everywhere)
-        if count not in programs:
-            programs[count] = compiled(run_chunk, *arguments)
-        return arguments
-
-    def run_steps(first, count, state, steps):
-        arguments = prepared(first, count, state, steps)
-        return programs[count](*arguments)
-
-    state = initial_state(model, network, seed)
-    look_at_swings(state.params)
+    state = placed.initial_state()
+    placed.refresh(state.params)
     if facts is None:  # before anything is written: whether it fits into memory
-        prepared(0, CHUNK if minutes is not None else min(CHUNK, steps or spec.steps), copied(mesh, state), 0)
-    if out is not None and facts is None:
-        write_run(out, {"steps": 0, "seed": seed, "scene": scene.to_dict()})
-        write_prepared(out, assembly.prepared)
-    checkpoints = None if out is None else Checkpoints(out)
-    every = -(-spec.checkpoint_every // CHUNK) * CHUNK
-    check = -(-spec.validate_every // CHUNK) * CHUNK
-    if facts is not None and facts["steps"]:
-        steps = facts["steps"]
-    elif minutes is not None:
+        placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps))
+    planned = 0 if facts is None else facts["steps"]
+    with closing(_Output(placed, out, report, planned)) as output:
+        if planned:
+            steps = planned
+        else:
+            fitting = None if minutes is None else _steps_within(60 * minutes, began, placed, output, state)
+            steps = fitting or steps or scene.training.steps
+            output.plan(steps)
+        state = placed.copied(output.restore(state))
+        return Run(assembly, _Loop(placed, output, state, steps, began).run(), steps)
 
-        def chunk(state):
-            state, _ = run_steps(0, CHUNK, state, CHUNK)
-            look(model, local(mesh, state.params), track, jnp.arange(4) % frames)
-            return jax.block_until_ready(state)
 
-        pace = _seconds(chunk, copied(mesh, initial_state(model, network, seed))) / CHUNK
-        if scene.motion.validation:
-            pace += _seconds(lambda s: _validate(Run(assembly, s.params)) and s, state) / check
-        if checkpoints is not None and checkpoints.latest() is None:
-            start = time.monotonic()
-            checkpoints.save(0, state)
-            pace += (time.monotonic() - start) / every
-        steps = max(CHUNK, int((60 * minutes - (time.monotonic() - began)) / (1.05 * pace)) // CHUNK * CHUNK)
-        steps = int(copied(mesh, steps))
-    else:
-        steps = steps or spec.steps
-    if out is not None and (facts is None or not facts["steps"]):
-        facts = {"steps": steps, "seed": seed, "scene": scene.to_dict(), "versions": _versions()}
-        write_run(out, facts)
+def _facts(out: Path | None, resume: bool) -> dict | None:
+    """Return what run.json says of the run to resume, None for a new run."""
+    if out is None or not (out / "run.json").exists():
+        if resume:
+            raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
+        return None
+    if not resume:
+        raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
+    return read_run(out)
 
-    if resume and checkpoints is not None and checkpoints.latest() is not None:
-        state = checkpoints.restore(state)
-    state = copied(mesh, state)
-    first = int(state.step)
-    look_at_swings(local(mesh, state.params))
-    if first:
-        look_at_contacts(local(mesh, state.params))
-    log = None if out is None else RunLog(out, first)
-    dropped, started, pace = int(state.dropped), time.monotonic(), None
-    moved: deque[float] = deque(maxlen=check // CHUNK)  # of one look alone, it may be that all its frames stand still
-    for at, count in chunks(first, steps):
-        state, logs = run_steps(at, count, state, steps)
-        here, logs = local(mesh, (state, logs))
-        if pace is None:  # this chunk was compiled
+
+class _Output:
+    """What a run writes into its folder, if it has one, and what it reports."""
+
+    def __init__(self, placed: PlacedScene, out: Path | None, report: Callable[[Report], None] | None, planned: int):
+        """Open the folder. `planned`: the steps that it already knows of; where there are none, it is a new one."""
+        self._placed, self._out, self._report = placed, out, report
+        self._checkpoints: Checkpoints | None = None
+        self._log: RunLog | None = None
+        if out is not None:
+            if not planned:
+                self.plan(0)
+                write_prepared(out, placed.assembly.prepared)
+            self._checkpoints = Checkpoints(out)
+
+    def plan(self, steps: int) -> None:
+        """Write into run.json how many steps the run has."""
+        if self._out is not None:
+            scene = self._placed.assembly.scene.to_dict()
+            write_run(self._out, {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()})
+
+    def seconds_of_a_first_checkpoint(self, state: TrainState) -> float:
+        """Write the state before the first step, unless there is one, and return how long that took."""
+        start = time.monotonic()
+        if self._checkpoints is not None and self._checkpoints.latest() is None:
+            self._checkpoints.save(0, state)
+        return time.monotonic() - start
+
+    def restore(self, state: TrainState) -> TrainState:
+        """Return the newest state of the folder, the one given where there is none."""
+        if self._checkpoints is None or self._checkpoints.latest() is None:
+            return state
+        return self._checkpoints.restore(state)
+
+    def begin_log(self, first: int) -> None:
+        """Open the log, whose rows after the step `first` are dropped."""
+        if self._out is not None:
+            self._log = RunLog(self._out, first)
+
+    def tell(self, entry: Report) -> None:
+        """Log a report and hand it to whoever wants it."""
+        if self._log is not None:
+            self._log.write(entry)
+        if self._report is not None:
+            self._report(entry)
+
+    def save(self, step: int, state: TrainState) -> None:
+        """Write a checkpoint."""
+        if self._checkpoints is not None:
+            self._checkpoints.save(step, state)
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._log is not None:
+            self._log.close()
+
+
+class _Loop:
+    """The steps of a run, chunk by chunk, with what it carries from one chunk to the next."""
+
+    def __init__(self, placed: PlacedScene, output: _Output, state: TrainState, steps: int, began: float):
+        """`state`: on the devices; it is used up. `began`: when training was called, s."""
+        spec = placed.assembly.scene.training
+        self._placed, self._output, self._state, self._steps, self._began = placed, output, state, steps, began
+        self._every, self._check = _whole_chunks(spec.checkpoint_every), _whole_chunks(spec.validate_every)
+        self._first, self._dropped = int(state.step), int(state.dropped)
+        # One look alone may see nothing but frames that stand still: these are all looks since the last validation.
+        self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
+        self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
+
+    def run(self) -> dict:
+        """Take every step that is left, and return the parameters."""
+        placed = self._placed
+        placed.refresh(placed.local(self._state.params))
+        if self._first:
+            placed.rebuild_lists(placed.local(self._state.params))
+        self._output.begin_log(self._first)
+        for at, count in chunks(self._first, self._steps):
+            self._take(at, count)
+        return placed.local(self._state.params)
+
+    def _take(self, at: int, count: int) -> None:
+        """Take the steps at to at + count, report them, and keep a checkpoint where one is due."""
+        placed, done = self._placed, at + count
+        self._state, logs = placed.run_chunk(self._state, at, count, self._steps)
+        here, logs = placed.local((self._state, logs))
+        if self._timed is None:  # this chunk was compiled
             give_back()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
-        done = at + count
-        seen = {
-            k: float(v)
-            for k, v in look(model, here.params, track, batches(frames, spec.batch, seed, done - 1, 1)[0, :4]).items()
-        }
-        message = ""
-        if int(here.dropped) > dropped:
-            dropped = int(here.dropped)
-            message = "step dropped: " + diagnose(model, network, here.params, track, here.fault)
-        validation = None
-        if scene.motion.validation and (done % check == 0 or done == steps):
-            validation = _validate(Run(assembly, here.params))
-        if "moved" in seen:
-            moved.append(seen["moved"])
-        if not message and moved and (mean := sum(moved) / len(moved)) < IDLE and (done % check == 0 or done == steps):
-            message = f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {mean:.2g} mm"
+        self._output.tell(self._entry(done, here, energies))
+        whole = done % self._every == 0
+        if whole or done == self._steps:
+            self._output.save(done, here)
+        if whole:  # where a run that is resumed begins
+            placed.refresh(here.params)
+        if whole or (done in EARLY and done < self._every):
+            placed.rebuild_lists(here.params)
+
+    def _entry(self, done: int, state: TrainState, energies: dict[str, float]) -> Report:
+        """Return the report of a chunk: it is measured, and validated where that is due."""
+        assembly, seen = self._placed.assembly, self._placed.measure(state.params, done)
+        due = done % self._check == 0 or done == self._steps
+        message = self._message(state, seen.get("moved"), due)
+        validation = _validate(Run(assembly, state.params)) if due and assembly.scene.motion.validation else None
+        return Report(
+            step=done,
+            steps=self._steps,
+            energies=energies,
+            strain=seen["strain"],
+            penetrating=seen.get("penetrating", 0.0),
+            dropped=self._dropped,
+            left=self._pace(done) * (self._steps - done),
+            seconds=time.monotonic() - self._began,
+            message=message,
+            validation=validation,
+            devices=self._placed.devices,
+            moved=seen.get("moved"),
+        )
+
+    def _message(self, state: TrainState, moved: float | None, due: bool) -> str:
+        """Return why a step of the chunk was dropped, or that alpha does nothing, or "" where all is well."""
+        if moved is not None:
+            self._moved.append(moved)
+        if int(state.dropped) > self._dropped:
+            self._dropped = int(state.dropped)
+            return "step dropped: " + self._placed.diagnose(state)
+        if due and self._moved and (mean := sum(self._moved) / len(self._moved)) < IDLE:
+            return f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {mean:.2g} mm"
+        return ""
+
+    def _pace(self, done: int) -> float:
+        """Return the seconds of a step since the first chunk, 0 after that chunk."""
         now = time.monotonic()
-        if pace is None:  # the first chunk compiles: it does not count for the pace
-            pace, started = 0.0, now
-        else:
-            pace = (now - started) / (done - first - min(CHUNK, count))
-        entry = Report(
-            done, steps, energies, seen["strain"], seen.get("penetrating", 0.0), dropped, now - began,
-            pace * (steps - done), message, validation, 1 if mesh is None else mesh.size, seen.get("moved"),
-        )  # fmt: skip
-        if log is not None:
-            log.write(entry)
-        if report is not None:
-            report(entry)
-        if checkpoints is not None and (done % every == 0 or done == steps):
-            checkpoints.save(done, here)
-        if done % every == 0:  # where a run that is resumed begins
-            look_at_swings(here.params)
-        if done % every == 0 or (done in EARLY and done < every):
-            look_at_contacts(here.params)
-    if checkpoints is not None:
-        checkpoints.close()
-    if log is not None:
-        log.close()
-    return Run(assembly, local(mesh, state.params), steps)
+        if self._timed is None:
+            self._timed = done, now
+            return 0.0
+        step, start = self._timed
+        return (now - start) / (done - step)
+
+
+def _whole_chunks(steps: int) -> int:
+    """Return the next multiple of CHUNK."""
+    return -(-steps // CHUNK) * CHUNK
+
+
+def _steps_within(seconds: float, began: float, placed: PlacedScene, output: _Output, state: TrainState) -> int:
+    """Return how many steps fit into so many seconds since `began`, by the pace of a few: whole chunks, one at least."""
+    assembly, spec = placed.assembly, placed.assembly.scene.training
+
+    def chunk(state):
+        state, _ = placed.run_chunk(state, 0, CHUNK, CHUNK)
+        placed.measure(placed.local(state.params), CHUNK)
+        return jax.block_until_ready(state)
+
+    def validate(state):
+        _validate(Run(assembly, state.params))
+        return state
+
+    pace = _seconds(chunk, placed.copied(placed.initial_state())) / CHUNK
+    if assembly.scene.motion.validation:
+        pace += _seconds(validate, state) / _whole_chunks(spec.validate_every)
+    pace += output.seconds_of_a_first_checkpoint(state) / _whole_chunks(spec.checkpoint_every)
+    left = seconds - (time.monotonic() - began)
+    steps = max(CHUNK, int(left / (1.05 * pace)) // CHUNK * CHUNK)
+    return int(placed.copied(steps))
 
 
 def _seconds(work: Callable, state) -> float:
-    """How long `work(state) -> state` takes once it is compiled."""
+    """Return how long `work(state) -> state` takes once it is compiled."""
     state = work(state)
     start = time.monotonic()
     work(state)
@@ -224,13 +267,11 @@ def _seconds(work: Callable, state) -> float:
 
 
 def _validate(run: Run) -> dict[str, float]:
-    """Mean over the validation motions of total energy, strain and penetration, this by the scene's own query."""
+    """Return means over the validation motions: total energy, strain, and penetration by the scene's own query."""
     rows = [summarise(run.evaluate(name, exact=False)) for name in run.assembly.scene.motion.validation]
     return {k: float(np.mean([r[k] for r in rows])) for k in ("total", "strain_mean", "penetrating") if k in rows[0]}
 
 
 def _versions() -> dict[str, str]:
-    return {
-        "python": platform.python_version(),
-        **{p: version(p) for p in ("ncs-jax", "jax", "flax", "optax", "orbax-checkpoint")},
-    }
+    names = ("ncs-jax", "jax", "flax", "optax", "orbax-checkpoint")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}

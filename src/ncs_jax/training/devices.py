@@ -1,4 +1,4 @@
-"""Where training runs: the batch divided among the devices of all hosts, everything else copied to each.
+"""Place training on devices: the batch divided among the devices of all hosts, everything else copied to each.
 
 Where there is one device the mesh is None, and what is handed over comes back as it was.
 """
@@ -20,7 +20,7 @@ __all__ = ["batch_mesh", "compiled", "copied", "divided", "free_memory", "give_b
 
 
 def batch_mesh(batch: int) -> Mesh | None:
-    """The most devices that divide the batch, as many on every host, along one axis "batch"; None for a single one.
+    """Return the most devices that divide the batch, as many on every host, along one axis "batch"; None for a single one.
 
     Raises:
         InputError: the hosts themselves do not divide it.
@@ -35,7 +35,7 @@ def batch_mesh(batch: int) -> Mesh | None:
 
 
 def copied(mesh: Mesh | None, tree):
-    """The first process's arrays on every device."""
+    """Return the first process's arrays on every device."""
     if mesh is None:
         return tree
     if jax.process_count() > 1:
@@ -46,7 +46,7 @@ def copied(mesh: Mesh | None, tree):
 
 
 def divided(mesh: Mesh | None, tree):
-    """Arrays (steps, batch), the same in every process, with each device's part of the batch on it."""
+    """Return arrays (steps, batch), the same in every process, with each device's part of the batch on it."""
     return tree if mesh is None else _spread(NamedSharding(mesh, P(None, "batch")), tree)
 
 
@@ -56,12 +56,12 @@ def _spread(sharding: NamedSharding, tree):
 
 
 def local(mesh: Mesh | None, tree):
-    """This process's first copy of arrays that every device has."""
+    """Return this process's first copy of arrays that every device has."""
     return tree if mesh is None else jax.tree.map(lambda a: a.addressable_data(0), tree)
 
 
 def free_memory() -> int | None:
-    """Bytes that a device of this process can still give: the accelerator's own, else the machine's; None where none tells."""
+    """Return the bytes that a device of this process can still give, or the machine; None where neither tells."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"] - stats["bytes_in_use"]
@@ -79,7 +79,7 @@ def free_memory() -> int | None:
 
 
 def compiled(program, *arguments):
-    """A training program compiled for its arguments, the first of which it may reuse, once it is known to fit into memory.
+    """Compile a training program for its arguments, the first of which it may reuse, if it fits into memory.
 
     Raises:
         InputError: what it needs beside its arguments is more than is free.

@@ -115,6 +115,10 @@ class Method(Protocol):
     def controlled(self) -> bool:
         """Whether alpha scales anything."""
 
+    @property
+    def refreshes(self) -> bool:
+        """Whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
+
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Fresh parameters of all but the decoder."""
 
@@ -131,6 +135,9 @@ class Method(Protocol):
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return energies (batch,) in J beyond the scene's terms, by name, and their gradient by the extra array, N."""
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions with what the network, as it is now, tells them. Training calls this now and then."""
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """Of every frame (frames, code) of one motion, from rest at its start."""

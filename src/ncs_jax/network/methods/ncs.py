@@ -29,6 +29,7 @@ class NCS:
     dynamic: DynamicEncoder | None
     decoder: Decoder
     learn_weights: bool = False
+    refreshes = False
 
     @property
     def code(self) -> int:
@@ -72,6 +73,10 @@ class NCS:
         return window_offsets(self, params, model, track, windows)
 
     coupling = staticmethod(no_coupling)
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions as they are."""
+        return features
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """z_S of every frame by itself, and z_D from rest at the motion's start."""

@@ -29,6 +29,7 @@ class PBNS:
     learn_weights: bool = False
     state = 0
     controlled = False
+    refreshes = False
 
     @property
     def code(self) -> int:
@@ -52,6 +53,10 @@ class PBNS:
         return window_offsets(self, params, model, track, windows)
 
     coupling = staticmethod(no_coupling)
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions as they are."""
+        return features
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """Of every frame by itself."""

@@ -29,6 +29,7 @@ class SNUG:
     decoder: Decoder
     learn_weights: bool = False
     controlled = False
+    refreshes = False
 
     @property
     def code(self) -> int:
@@ -62,6 +63,10 @@ class SNUG:
         return window_offsets(self, params, model, track, windows)
 
     coupling = staticmethod(no_coupling)
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions as they are."""
+        return features
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """From a state of zero at the motion's start."""

@@ -54,6 +54,7 @@ class Swing:
     damping: float
     learn_weights: bool = False
     controlled = True
+    refreshes = True
 
     @property
     def code(self) -> int:
@@ -94,6 +95,10 @@ class Swing:
         new = jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in (x, previous, now, q, jnp.ones_like(started))])
         q = q.T.reshape(*shape, self.modes)
         return new.T.reshape(*shape, self.state), Codes(fixed, self._dynamic(params, q), q)
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions with the swing of every frame, which `windows` and `mixed` look up."""
+        return replace(features, swing=self.swings(params, model, features))
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
         """Of every frame, without a swing at its motion's start."""

@@ -1,0 +1,132 @@
+"""A scene on the devices that train it: its constants and motions there, and the programs compiled for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from ncs_jax.energies.contact.surface import rebuild_lists
+from ncs_jax.network.methods.method import Method
+from ncs_jax.network.rollout import animate
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.training.batches import batches
+from ncs_jax.training.devices import batch_mesh, compiled, copied, divided, local
+from ncs_jax.training.loss import with_bodies
+from ncs_jax.training.metrics import diagnose, training_metrics
+from ncs_jax.training.step import TrainState, chunk_runner, initial_state
+
+__all__ = ["PlacedScene"]
+
+SAMPLED = 64  # poses that the search for contacts is prepared for
+SEEN = 4  # frames that are measured between chunks
+
+
+class PlacedScene:
+    """A scene made ready, on every device that trains it, and the programs that train it there.
+
+    `model` and `features` are this process's own copies. They hold the same numbers as those on the devices.
+    """
+
+    def __init__(self, assembly: Assembly, seed: int):
+        spec, network = assembly.scene.training, assembly.network
+        self.assembly, self.seed = assembly, seed
+        self.model, self.features = assembly.model, assembly.track
+        self.mesh = batch_mesh(spec.batch)
+        self._chunk = chunk_runner(network, spec, self.mesh)
+        self._compiled: dict[int, Callable] = {}
+        self._everywhere = copied(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
+        self._metrics = jax.jit(lambda *args: training_metrics(args[0], network, spec.window, *args[1:]))
+        self._pose = jax.jit(lambda model, *args: _garment_and_body(model, network, *args))
+        self._told = jax.jit(lambda *args: _told(network, *args)) if network.refreshes else None
+
+    @property
+    def devices(self) -> int:
+        """How many devices train."""
+        return 1 if self.mesh is None else self.mesh.size
+
+    def initial_state(self) -> TrainState:
+        """Return the state that the seed gives, in this process alone."""
+        return initial_state(self.model, self.assembly.network, self.seed)
+
+    def copied(self, tree):
+        """Return the first process's arrays on every device."""
+        return copied(self.mesh, tree)
+
+    def local(self, tree):
+        """Return this process's copy of arrays that every device has."""
+        return local(self.mesh, tree)
+
+    def compile(self, state: TrainState, count: int) -> None:
+        """Compile the program of a chunk of `count` steps.
+
+        Raises:
+            InputError: it does not fit into memory.
+        """
+        self._ready(self._arguments(self.copied(state), 0, count, 0))
+
+    def run_chunk(self, state: TrainState, first: int, count: int, steps: int) -> tuple[TrainState, dict[str, Array]]:
+        """Take the steps first to first + count of `steps`; the state given is used up. Return the new one and the logs."""
+        arguments = self._arguments(state, first, count, steps)
+        return self._ready(arguments)(*arguments)
+
+    def measure(self, params: dict, done: int) -> dict[str, float]:
+        """Return `training_metrics` of a few frames of the last of the `done` steps."""
+        ends = self._ends(done - 1, 1)[0, :SEEN]
+        return {k: float(v) for k, v in self._metrics(self.model, params, self.features, ends).items()}
+
+    def diagnose(self, state: TrainState) -> str:
+        """Return why the last dropped step was dropped."""
+        return diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
+
+    def refresh(self, params: dict) -> None:
+        """Tell the motions what the network tells them now, if it tells them anything: see `Method.refresh`."""
+        if self._told is not None:
+            told = self._told(params, self.model, self.assembly.track)
+            model, features = self._everywhere
+            self.features = replace(self.features, **told)
+            self._everywhere = model, replace(features, **self.copied(told))
+
+    def rebuild_lists(self, params: dict) -> None:
+        """Tell the search for the nearest vertex where the garment is now: it finds the same, several times as fast."""
+        if self.model.terms.collision != "plane" or not self.model.terms.exact:
+            return
+        motions = self.assembly.track
+        some = np.unique(np.linspace(0, motions.start.shape[0] - 1, SAMPLED).astype(int))
+        part = replace(jax.tree.map(lambda a: a[some], motions), origin=None)
+        cloth, body = map(np.asarray, self._pose(self.model, params, part))
+        surface = rebuild_lists(self.model.surface, list(zip(cloth, body, strict=True)))
+        self.model = replace(self.model, surface=surface)
+        self._everywhere = self.copied(self.model), self._everywhere[1]
+
+    def _ends(self, first: int, count: int) -> np.ndarray:
+        return batches(self.features.start.shape[0], self.assembly.scene.training.batch, self.seed, first, count)
+
+    def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
+        ends = self._ends(first, count)
+        each = [np.random.default_rng([self.seed, 1, step]) for step in range(first, first + count)]
+        pairs = np.stack([rng.permutation(ends.shape[1]) for rng in each]).astype(np.int32)
+        return (state, *divided(self.mesh, (ends, pairs)), steps, *self._everywhere)
+
+    def _ready(self, arguments: tuple) -> Callable:
+        """Return the program for a chunk's arguments, compiled once for every number of steps."""
+        count = len(arguments[1])
+        if count not in self._compiled:
+            self._compiled[count] = compiled(self._chunk, *arguments)
+        return self._compiled[count]
+
+
+def _garment_and_body(model: Model, network: Method, params: dict, motions: MotionFeatures) -> tuple[Array, Array]:
+    """Return the vertices of the garment, static, and of the body in every frame."""
+    return animate(model, network, params, motions, None), jax.vmap(lambda at: pose_body(model, at))(motions.matrices)
+
+
+def _told(network: Method, params: dict, model: Model, motions: MotionFeatures) -> dict[str, Array]:
+    """Return the fields that `refresh` changes, and no others: a compiled program would copy them."""
+    new = network.refresh(params, model, motions)
+    return {f.name: getattr(new, f.name) for f in fields(new) if getattr(new, f.name) is not getattr(motions, f.name)}
