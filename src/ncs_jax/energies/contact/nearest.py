@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,7 @@ def _smallest(values, count):
 
 
 def nearest_groups(cloth, grouped, count):
-    """Of every cloth group, the squared gap of bounding boxes to the first group left out, and the `count` nearest groups."""
+    """Return for every cloth group the squared gap of bounding boxes to the first group left out, and the `count` nearest groups."""
     corners = grouped.reshape(len(grouped), -1, 3)
     low, high = corners.min(axis=1), corners.max(axis=1)
     gap = jnp.maximum(jnp.maximum(low[None] - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high[None]), 0)
@@ -174,10 +175,17 @@ def _repair(x, name, proven, features, squared, many, size=32):
     return lax.fori_loop(0, turns, mend, name)
 
 
-def _search(x, features, blocks, lists, surface, squared, many, exact):
+class _Groups(NamedTuple):
+    """Compact groups of the body's features, and those that every cloth group looks at."""
+
+    blocks: Int[Array, "groups size"]
+    lists: Int[Array, "near blocks"]
+
+
+def _search(x, features, groups: _Groups, surface, squared, many, exact):
     poses = x.shape[2:]
     x, features = components(lax.stop_gradient(x)), lax.stop_gradient(features)
-    name, proven = _candidates(x, features, blocks, lists, surface, squared)
+    name, proven = _candidates(x, features, *groups, surface, squared)
     if not exact:
         return name, proven
     one = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, components(features)))
@@ -187,18 +195,18 @@ def _search(x, features, blocks, lists, surface, squared, many, exact):
 def nearest_vertex(
     x: Float[Array, "verts 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
 ) -> tuple[Int[Array, "verts *poses"], Bool[Array, "verts *poses"]]:
-    """Nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
+    """Find the nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
 
     With `exact` the rest is searched in full, so the answer is that of a full search whatever the pose; without it the
     candidates' best stands, and the second result tells which answers are certain. At most one axis of poses.
     """
-    return _search(x, body, surface.vertex_blocks, surface.vertex_lists, surface, _squared_to_points, 32, exact)
+    return _search(x, body, _Groups(surface.vertex_blocks, surface.vertex_lists), surface, _squared_to_points, 32, exact)
 
 
 def nearest_triangle(
     x: Float[Array, "verts 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
 ) -> tuple[Int[Array, "verts *poses"], Bool[Array, "verts *poses"]]:
-    """Nearest body triangle of every cloth vertex by exact point-triangle distance; results as in `nearest_vertex`.
+    """Find the nearest body triangle of every cloth vertex by exact point-triangle distance; results as in `nearest_vertex`.
 
     Of one pose, the candidates are the `NEAR` groups that are nearest there, which prove nearly all: it pays to look, as a
     triangle's distance costs so much more than a box's.
@@ -207,4 +215,4 @@ def nearest_triangle(
     if x.ndim == 2 and exact:
         cloth, grouped = (lax.stop_gradient(a) for a in (x[surface.cloth_blocks], triangles[surface.face_blocks]))
         lists = nearest_groups(cloth, grouped, NEAR)[1].T
-    return _search(x, triangles, surface.face_blocks, lists, surface, _squared_to_triangles, 2, exact)
+    return _search(x, triangles, _Groups(surface.face_blocks, lists), surface, _squared_to_triangles, 2, exact)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -137,11 +138,27 @@ def elimination(pairs: np.ndarray, points: np.ndarray) -> Elimination:
     return _symbolic(tree, pairs, verts)
 
 
-def _symbolic(tree: list[list[np.ndarray]], pairs: np.ndarray, verts: int) -> Elimination:
-    from scipy.sparse import csr_matrix
+class _Order(NamedTuple):
+    """Where every vertex is in the tree, and where every block enters."""
 
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    graph = csr_matrix((np.ones(len(both), np.int8), both.T), shape=(verts, verts))
+    rank: np.ndarray  # (verts,) when it is eliminated
+    depth: np.ndarray  # (verts,) of its node
+    node: np.ndarray  # (verts,) its node among those of one depth
+    place: np.ndarray  # (verts,) in its node
+    early: np.ndarray  # (pairs,) the vertex of a pair that is eliminated first: there its block enters,
+    late: np.ndarray  # (pairs,) and the other one
+    flipped: np.ndarray  # (pairs,) whether the first is eliminated first
+
+
+class _Deeper(NamedTuple):
+    """The nodes one level deeper."""
+
+    borders: list[np.ndarray]
+    position: np.ndarray  # of a node among the updates
+    widest: int  # of the borders
+
+
+def _order(tree: list[list[np.ndarray]], pairs: np.ndarray, verts: int) -> _Order:
     rank, depth_of, node_of, place_of = (np.zeros(verts, np.int64) for _ in range(4))
     count = 0
     for depth in range(len(tree) - 1, -1, -1):
@@ -149,61 +166,67 @@ def _symbolic(tree: list[list[np.ndarray]], pairs: np.ndarray, verts: int) -> El
             rank[members] = count + np.arange(len(members))
             depth_of[members], node_of[members], place_of[members] = depth, node, np.arange(len(members))
             count += len(members)
-    first = rank[pairs].argmin(axis=1)  # a block enters where the first of its two vertices is eliminated
+    first = rank[pairs].argmin(axis=1)
     early, late = pairs[np.arange(len(pairs)), first], pairs[np.arange(len(pairs)), 1 - first]
+    return _Order(rank, depth_of, node_of, place_of, early, late, first == 0)
+
+
+def _group(nodes, own, borders, entering, order: _Order, deeper: _Deeper) -> Group:
+    """Some nodes of a level, padded to one size: their fronts, the blocks that enter there, and the updates from below."""
+    verts = len(order.rank)
+    p, b = max(len(own[n]) for n in nodes), max(len(borders[n]) for n in nodes)
+    local = np.full((len(nodes), p + b), verts)
+    place = np.zeros((len(nodes), verts + 1), np.int64)
+    for i, n in enumerate(nodes):
+        local[i, : len(own[n])] = own[n]
+        local[i, p : p + len(borders[n])] = borders[n]
+        place[i, local[i]] = np.arange(p + b)
+    index = np.full(len(own), -1)
+    index[nodes] = np.arange(len(nodes))
+    mine = entering[index[order.node[order.early[entering]]] >= 0]
+    front = index[order.node[order.early[mine]]]
+    children = columns = None
+    if deeper.borders:
+        columns = np.full((len(nodes), 2, p + b), deeper.widest)
+        for i, n in enumerate(nodes):
+            for k in range(2):
+                lookup = np.full(verts + 1, deeper.widest)
+                lookup[deeper.borders[2 * n + k]] = np.arange(len(deeper.borders[2 * n + k]))
+                columns[i, k] = lookup[local[i]]
+        update = deeper.position[2 * np.asarray(nodes)[:, None] + np.arange(2)]
+        children = update[:, :, None] * (deeper.widest + 1) + columns
+    array = lambda a: None if a is None else jnp.asarray(a, jnp.int32)  # noqa: E731
+    return Group(
+        pivots=array(local[:, :p]),
+        border=array(local[:, p:]),
+        blocks=array(mine),
+        places=array(np.stack([front, place[front, order.late[mine]], order.place[order.early[mine]]], axis=1)),
+        flipped=array(order.flipped[mine]),
+        children=array(children),
+        columns=array(columns),
+    )
+
+
+def _symbolic(tree: list[list[np.ndarray]], pairs: np.ndarray, verts: int) -> Elimination:
+    from scipy.sparse import csr_matrix
+
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    graph = csr_matrix((np.ones(len(both), np.int8), both.T), shape=(verts, verts))
+    order = _order(tree, pairs, verts)
     levels: list[tuple[Group, ...]] = []
-    below: list[np.ndarray] = []  # borders of the nodes one level deeper
-    position = np.zeros(0, np.int64)  # of a node one level deeper among the updates
-    widest = 0
+    deeper = _Deeper([], np.zeros(0, np.int64), 0)
     for depth in range(len(tree) - 1, -1, -1):
         own = tree[depth]
         borders = []
         for node, members in enumerate(own):
-            parts = [np.unique(graph[members].indices)] + [below[c] for c in (2 * node, 2 * node + 1) if below]
-            border = np.unique(np.concatenate(parts)).astype(np.int64)
-            border = border[depth_of[border] < depth]
-            borders.append(border[np.argsort(rank[border])])
-        entering = np.flatnonzero(depth_of[early] == depth)
-        groups = []
-        order = []
-        for nodes in _groups([len(m) for m in own], [len(b) for b in borders]):
-            p, b = max(len(own[n]) for n in nodes), max(len(borders[n]) for n in nodes)
-            local = np.full((len(nodes), p + b), verts)
-            place = np.zeros((len(nodes), verts + 1), np.int64)
-            for i, n in enumerate(nodes):
-                local[i, : len(own[n])] = own[n]
-                local[i, p : p + len(borders[n])] = borders[n]
-                place[i, local[i]] = np.arange(p + b)
-            index = np.full(len(own), -1)
-            index[nodes] = np.arange(len(nodes))
-            mine = entering[index[node_of[early[entering]]] >= 0]
-            front = index[node_of[early[mine]]]
-            children = columns = None
-            if below:
-                columns = np.full((len(nodes), 2, p + b), widest)
-                for i, n in enumerate(nodes):
-                    for k in range(2):
-                        lookup = np.full(verts + 1, widest)
-                        lookup[below[2 * n + k]] = np.arange(len(below[2 * n + k]))
-                        columns[i, k] = lookup[local[i]]
-                update = position[2 * np.asarray(nodes)[:, None] + np.arange(2)]
-                children = update[:, :, None] * (widest + 1) + columns
-            array = lambda a: None if a is None else jnp.asarray(a, jnp.int32)  # noqa: E731
-            groups.append(
-                Group(
-                    pivots=array(local[:, :p]),
-                    border=array(local[:, p:]),
-                    blocks=array(mine),
-                    places=array(np.stack([front, place[front, late[mine]], place_of[early[mine]]], axis=1)),
-                    flipped=array(first[mine] == 0),
-                    children=array(children),
-                    columns=array(columns),
-                )
-            )
-            order += list(nodes)
-        levels.append(tuple(groups))
-        position = np.argsort(order)
-        below, widest = borders, max(len(b) for b in borders)
+            below = [deeper.borders[c] for c in (2 * node, 2 * node + 1) if deeper.borders]
+            border = np.unique(np.concatenate([np.unique(graph[members].indices), *below])).astype(np.int64)
+            border = border[order.depth[border] < depth]
+            borders.append(border[np.argsort(order.rank[border])])
+        entering = np.flatnonzero(order.depth[order.early] == depth)
+        parts = _groups([len(m) for m in own], [len(b) for b in borders])
+        levels.append(tuple(_group(nodes, own, borders, entering, order, deeper) for nodes in parts))
+        deeper = _Deeper(borders, np.argsort(np.concatenate(parts)), max(len(b) for b in borders))
     return Elimination(tuple(levels), verts)
 
 

@@ -115,9 +115,8 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     """Return positions that minimise the energy, found from `start`, and how the solve went."""
     direction = DIRECTIONS[settings.solver]
     mass = jnp.sum(problem.mass)
-    tolerance = settings.tolerance
-    if tolerance is None:
-        tolerance = 0.1 if start.dtype == jnp.float32 else 0.001
+    usual = 0.1 if start.dtype == jnp.float32 else 0.001
+    tolerance = usual if settings.tolerance is None else settings.tolerance
     limit = jnp.where(problem.step.moving > 0, settings.iterations, settings.first)
 
     def unfinished(state):
