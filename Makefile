@@ -10,18 +10,21 @@ INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versio
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
 
+# A file's tests share scenes and compiled programs: they stay in one process.
+WORKERS = -n 2 --dist loadfile --no-loadscope-reorder
 test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m "not slow and not gpu"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(WORKERS) -m "not slow and not gpu"
 
+# Slow tests too, and every program compiled as users compile it.
 test-all: .venv/ready
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m "not gpu"
+	NCS_OPTIMISED=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(WORKERS) -m "not gpu"
 
 # 10,000 cases of every property, and 1,000 damaged files of every reader. About half an hour.
 thorough: .venv/ready
-	NCS_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal tests/test_properties.py tests/test_io.py
+	NCS_THOROUGH=1 NCS_OPTIMISED=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(WORKERS) tests/test_properties.py tests/test_io.py
 
 # Every benchmark on its packaged scene, or on SCENE: tables on the screen, figures in runs/bench. About a quarter of an hour.
 BENCHMARKS = training inference quality simulator growth

@@ -5,10 +5,25 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import jax
-import numpy as np
-import pytest
-from jaxtyping import install_import_hook
+# Nearly all of the time goes into compiling programs that then run for milliseconds: code that is compiled four times
+# faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
+FAST = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+GIVEN = os.environ.get("XLA_FLAGS", "").replace(FAST, "").strip()
+AS_USERS = {**os.environ, "XLA_FLAGS": GIVEN}  # the environment of a process that compiles as users do
+if not os.environ.get("NCS_OPTIMISED"):
+    os.environ["XLA_FLAGS"] = f"{FAST} {GIVEN}"  # before JAX starts; of a flag given twice, the last counts
+
+# For a program that runs for seconds: `jax.jit(f, compiler_options=OPTIMISED)`.
+OPTIMISED = {
+    "xla_backend_optimization_level": 3,
+    "xla_cpu_use_fusion_emitters": True,
+    "xla_llvm_disable_expensive_passes": False,
+}
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -27,14 +42,27 @@ install_import_hook([f"ncs_jax.{name}" for name in ARRAYS], CHECKER)
 # `make thorough`: as many cases of every property and of every damaged file as a release is to withstand.
 THOROUGH = bool(os.environ.get("NCS_THOROUGH"))
 
+# Files by what they cost, the dearest first, so that no worker begins a long one when the others are done.
+DEAREST = ["test_experiments", "test_notebook", "test_devices", "test_benchmarks", "test_training", "test_export", "test_runs"]
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: DEAREST.index(item.path.stem) if item.path.stem in DEAREST else len(DEAREST))
+
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+MAPS = 20_000  # Linux lets a process hold 65,530
 
 
 @pytest.fixture(autouse=True, scope="module")
 def programs():
-    """What a module has compiled is let go after it: a process may hold only so many pieces of memory, and dies of one more."""
+    """Let compiled programs go in good time: each holds some ten pieces of memory, and a process of too many pieces dies."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture

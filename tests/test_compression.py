@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ncs_jax.network.compression import compress
-from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.scene.model import local_rotations
 
-from .test_rollout import ready, run
+from .ready import animated, ready, run
 
 
 def error(whole, smaller):
@@ -18,15 +18,15 @@ def error(whole, smaller):
 
 
 @pytest.fixture
-def garment(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def garment():
+    assembly, params, motion = ready()
     return assembly, params, motion, features_from_records(assembly.model, motion)
 
 
 def smaller(garment, **options):
     assembly, params, _, track = garment
     network, params = compress(assembly.network, params, assembly.model, track, **options)
-    return network, params, np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, network, params, track))
+    return network, params, np.asarray(animated(assembly.model, network, params, track))
 
 
 def test_the_full_rank_is_the_whole_decoder_on_that_motion(garment):
@@ -60,13 +60,13 @@ def test_a_smaller_decoder_holds_fewer_numbers_and_streams_what_it_animates(garm
         np.testing.assert_allclose(x, vertices[frame], rtol=0, atol=1e-10)
 
 
-def test_sixteen_bits_cost_a_rounding_of_the_offsets(tmp_path):
-    assembly, params, motion = ready(tmp_path, jnp.float32)
+def test_sixteen_bits_cost_a_rounding_of_the_offsets():
+    assembly, params, motion = ready(jnp.float32)
     track = features_from_records(assembly.model, motion)
     network, short = compress(assembly.network, params, assembly.model, track, bfloat16=True)
     assert short["decoder"]["offsets"]["kernel"].dtype == jnp.bfloat16
     whole = run(assembly, params, motion)
-    x = np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, network, short, track))
+    x = np.asarray(animated(assembly.model, network, short, track))
     assert x.dtype == np.float32
     zero = jax.tree.map(jnp.zeros_like, params["decoder"])
     size = error(whole, run(assembly, {**params, "decoder": zero}, motion)).max()

@@ -18,6 +18,7 @@ import pytest
 
 from benchmarks.cost import COUNTS, counted
 
+from .conftest import AS_USERS
 from .scenes import write_scene
 
 RECORD = Path(__file__).parent / "cost.json"
@@ -29,7 +30,7 @@ def measured(folder, *options):
     """The counts of the scene of the tests, from a process of its own: JAX as a user has it, and a time limit."""
     out = folder / "cost.json"
     command = [sys.executable, "-m", "benchmarks.cost", str(write_scene(folder)), "--json", str(out), *options]
-    subprocess.run(command, check=True, timeout=300, cwd=RECORD.parents[1], stdout=subprocess.DEVNULL)
+    subprocess.run(command, check=True, timeout=300, cwd=RECORD.parents[1], env=AS_USERS, stdout=subprocess.DEVNULL)
     return json.loads(out.read_text())["rows"]
 
 

@@ -5,6 +5,8 @@ The descriptors' and the networks' own parts of this are in their tests; rest an
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.network.methods.method import decode
-from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations
-from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.step import initial_state
 
-from .scenes import write_scene
+from .ready import assembled, edited, run
 
 GRAVITIES = {"-y": (0.0, -9.81, 0.0), "-z": (0.0, 0.0, -9.81), "+x": (1.62, 0.0, 0.0), "aslant": (3.0, -8.0, 2.0)}
 BIG_TURN = np.radians(73)
@@ -40,11 +42,9 @@ def awake(state, size):
     return jax.tree_util.tree_map_with_path(shake, state.params)
 
 
-def tiny(folder, dtype=jnp.float64, gravity=GRAVITIES["-y"]):
+def tiny(dtype=jnp.float64, gravity=GRAVITIES["-y"]):
     """A scene, its weights, and a motion on which nothing is special: every joint turns, the root tilts and wanders."""
-    tables = load_scene(write_scene(folder)).to_dict()
-    tables["physics"]["gravity"] = list(gravity)
-    assembly = assemble(scene_from(tables), dtype=dtype)
+    assembly = assembled({"physics.gravity": gravity}, dtype)
     params = awake(initial_state(assembly.model, assembly.network, 4), 0.2)
     t = np.arange(24)[:, None, None] / 30
     wave = np.array([[2.0, 3.1, 2.6], [5.0, 4.0, 3.0]])
@@ -53,31 +53,20 @@ def tiny(folder, dtype=jnp.float64, gravity=GRAVITIES["-y"]):
     return assembly, params, io.MotionRecord(poses, translation, 30.0, ())
 
 
-def run(assembly, params, motion, alpha=1.0):
-    track = features_from_records(assembly.model, motion)
-    return np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, assembly.network, params, track, alpha))
-
-
-def changed(motion, poses=None, translation=None):
-    return io.MotionRecord(
-        motion.poses if poses is None else poses, motion.translation if translation is None else translation, motion.fps, ()
-    )
-
-
 def turned(motion, root, axis, angle=BIG_TURN):
     """Character and motion turned about an axis through the origin; the root's rest position is `root`."""
     turn = Rotation.from_rotvec(angle * np.asarray(axis) / np.linalg.norm(axis))
     poses = np.array(motion.poses, np.float64)
     poses[:, 0] = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
-    return changed(motion, poses, turn.apply(motion.translation + root) - root), turn.as_matrix()
+    return edited(motion, poses, turn.apply(motion.translation + root) - root), turn.as_matrix()
 
 
 # --- space ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("gravity", GRAVITIES)
-def test_turning_about_gravity_turns_the_prediction(tmp_path, gravity):
-    assembly, params, motion = tiny(tmp_path, gravity=GRAVITIES[gravity])
+def test_turning_about_gravity_turns_the_prediction(gravity):
+    assembly, params, motion = tiny(gravity=GRAVITIES[gravity])
     here = run(assembly, params, motion)
     assert np.abs(here - run(assembly, params, motion, 0.0)).max() > 5e-3  # the dynamics have their part in it
     root = assembly.body.joints[0]
@@ -91,17 +80,17 @@ def test_turning_about_gravity_turns_the_prediction(tmp_path, gravity):
 
 
 @pytest.mark.parametrize("gravity", GRAVITIES)
-def test_turning_about_gravity_in_single_precision(tmp_path, plain_jax, gravity):
-    assembly, params, motion = tiny(tmp_path, jnp.float32, GRAVITIES[gravity])
+def test_turning_about_gravity_in_single_precision(plain_jax, gravity):
+    assembly, params, motion = tiny(jnp.float32, GRAVITIES[gravity])
     other, turn = turned(motion, assembly.body.joints[0], GRAVITIES[gravity])
     here, there = run(assembly, params, motion), run(assembly, params, other)
     assert here.dtype == np.float32
     np.testing.assert_allclose(there, here @ turn.T, rtol=0, atol=1e-5)
 
 
-def test_turning_a_stream_about_gravity(tmp_path):
+def test_turning_a_stream_about_gravity():
     """Frame by frame with explicit state, as a game would."""
-    assembly, params, motion = tiny(tmp_path, gravity=GRAVITIES["aslant"])
+    assembly, params, motion = tiny(gravity=GRAVITIES["aslant"])
     other, turn = turned(motion, assembly.body.joints[0], GRAVITIES["aslant"])
     init, step = stepper(assembly.model, assembly.network, params)
     step = jax.jit(step)
@@ -150,64 +139,69 @@ stiffness = 0
     np.testing.assert_allclose(there, here @ turn.T, rtol=0, atol=1e-5)
 
 
-def test_the_place_in_the_world_does_not_matter(tmp_path):
-    assembly, params, motion = tiny(tmp_path)
+def test_the_place_in_the_world_does_not_matter():
+    assembly, params, motion = tiny()
     away = np.array([7.0, -3.0, 11.0])
-    there = run(assembly, params, changed(motion, translation=motion.translation + away))
+    there = run(assembly, params, edited(motion, translation=motion.translation + away))
     np.testing.assert_allclose(there, run(assembly, params, motion) + away, rtol=0, atol=1e-10)
 
 
-def test_strength_of_gravity_is_no_input(tmp_path):
+def test_strength_of_gravity_is_no_input():
     """Descriptors hold its direction alone: what its strength does to the cloth is learned, by the energy."""
-    assembly, params, motion = tiny(tmp_path, gravity=(0.0, -9.81, 0.0))
-    moon, _, _ = tiny(tmp_path, gravity=(0.0, -1.62, 0.0))
+    assembly, params, motion = tiny(gravity=(0.0, -9.81, 0.0))
+    moon, _, _ = tiny(gravity=(0.0, -1.62, 0.0))
     np.testing.assert_allclose(run(moon, params, motion), run(assembly, params, motion), rtol=0, atol=1e-13)
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_known_of_the_future(tmp_path):
-    assembly, params, motion = tiny(tmp_path)
+def test_nothing_is_known_of_the_future():
+    assembly, params, motion = tiny()
     poses, translation = motion.poses.copy(), motion.translation.copy()
     poses[15:], translation[15:] = -2 * poses[15:], 0
-    here, there = run(assembly, params, motion), run(assembly, params, changed(motion, poses, translation))
+    here, there = run(assembly, params, motion), run(assembly, params, edited(motion, poses, translation))
     assert np.array_equal(here[:15], there[:15])
     assert np.abs(here[15] - there[15]).max() > 1e-3
 
 
-def test_the_static_result_knows_only_its_own_frame(tmp_path):
-    assembly, params, motion = tiny(tmp_path)
+def test_the_static_result_knows_only_its_own_frame():
+    assembly, params, motion = tiny()
     order = np.random.default_rng(0).permutation(len(motion.poses))
-    shuffled = changed(motion, motion.poses[order], motion.translation[order])
+    shuffled = edited(motion, motion.poses[order], motion.translation[order])
     here = run(assembly, params, motion, 0.0)
     np.testing.assert_allclose(run(assembly, params, shuffled, 0.0), here[order], rtol=0, atol=1e-14)
     assert np.abs(run(assembly, params, shuffled) - run(assembly, params, motion)[order]).max() > 1e-3
 
 
-def test_a_steady_ride_is_rest(tmp_path):
+def test_a_steady_ride_is_rest():
     """Galileo: once the start is forgotten, a constant velocity leaves no trace."""
-    assembly, params, motion = tiny(tmp_path)
+    assembly, params, motion = tiny()
     frames = 100
     poses = np.repeat(motion.poses[5:6], frames, axis=0)
     velocity = np.array([3.0, 0.5, -1.0])
-    ride = changed(motion, poses, velocity * np.arange(frames)[:, None] / 30)
+    ride = edited(motion, poses, velocity * np.arange(frames)[:, None] / 30)
     difference = np.abs(run(assembly, params, ride) - run(assembly, params, ride, 0.0)).max(axis=(1, 2))
     assert difference[1] > 1e-3 and difference[-1] < 1e-8
-    braking = changed(ride, translation=np.minimum(np.arange(frames), 60)[:, None] * velocity / 30)
+    braking = edited(ride, translation=np.minimum(np.arange(frames), 60)[:, None] * velocity / 30)
     difference = np.abs(run(assembly, params, braking) - run(assembly, params, braking, 0.0)).max(axis=(1, 2))
     assert difference[59] < 1e-5 and difference[61] > 1e-3
 
 
+@partial(jax.jit, static_argnums=(0, 4))
+def windows(network, params, track, ends, frames):
+    return network.windows(params, track, ends, frames, frames)
+
+
 @pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0, 2.5, -1.0])
-def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
+def test_alpha_scales_the_dynamic_code_and_nothing_else(alpha):
     """z = z_S + alpha z_D (15), with the codes that training sees in a window that reaches back to the motion's start."""
-    assembly, params, motion = tiny(tmp_path)
+    assembly, params, motion = tiny()
     model, network = assembly.model, assembly.network
     track = features_from_records(model, motion)
     frames = len(motion.poses)
     ends = jnp.array([frames - 1], jnp.int32)
-    codes = jax.jit(lambda p, t: network.windows(p, t, ends, frames, frames))(params, track)
+    codes = windows(network, params, track, ends, frames)
     z_static, z_dynamic = (z[:, 0] for z in codes[:2])
     np.testing.assert_allclose(network.codes(params, model, track)[0], z_static, rtol=0, atol=1e-13)
     offsets = np.moveaxis(np.asarray(decode(network, params, model, z_static + alpha * z_dynamic)), -1, 0)
@@ -217,9 +211,9 @@ def test_alpha_scales_the_dynamic_code_and_nothing_else(tmp_path, alpha):
     np.testing.assert_allclose(run(assembly, params, motion, alpha), expected, rtol=0, atol=1e-12)
 
 
-def test_a_window_that_begins_within_the_motion_begins_at_rest(tmp_path):
+def test_a_window_that_begins_within_the_motion_begins_at_rest():
     """What training sees is a stream that was switched on at the window's first frame, with the frames before it known."""
-    assembly, params, motion = tiny(tmp_path)
+    assembly, params, motion = tiny()
     network = assembly.network
     track = features_from_records(assembly.model, motion)
     end, length = 17, 6

@@ -83,7 +83,7 @@ def alone(monkeypatch):
     """Everything in this process: starting others takes longer than what they do here."""
     for module in (control, methods):
         monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
-    for module in (study, architecture, budget, descriptors):
+    for module in (study, methods, architecture, budget, descriptors):
         monkeypatch.setattr(module, "abreast", lambda jobs: [job(*arguments) for job, *arguments in jobs])
 
 

@@ -27,8 +27,8 @@ from ncs_jax.runs.run import Run, assemble
 from ncs_jax.scene.model import local_rotations
 from ncs_jax.scene.spec import load_scene, scene_from
 
+from .ready import ready, shaken
 from .scenes import post, swing, write_scene
-from .test_rollout import ready, shaken
 
 ROOT = Path(__file__).parents[1]
 METHODS = ["gated", "linear", "swing", "pbns", "snug"]
@@ -45,9 +45,9 @@ def _plain(plain_jax):
     yield
 
 
-def garment(folder, kind):
+def garment(kind):
     method, cell = (kind, "gated") if kind in ("swing", "pbns", "snug") else ("ncs", kind)
-    return ready(folder, jnp.float32, method, cell)
+    return ready(jnp.float32, method, cell)
 
 
 def long(frames=240):
@@ -85,7 +85,7 @@ def played(file, motion, alpha=1.0):
 
 @pytest.mark.parametrize("kind", METHODS)
 def test_onnx_gives_what_the_stepper_gives(tmp_path, kind):
-    assembly, params, _ = garment(tmp_path, kind)
+    assembly, params, _ = garment(kind)
     motion, file = long(), tmp_path / "out" / "step.onnx"
     made = export(assembly, params, file, motion=motion)
     assert made.check.max_difference < 1e-5 and made.check.frames == 240 and made.check.error is None
@@ -101,7 +101,7 @@ def test_onnx_gives_what_the_stepper_gives(tmp_path, kind):
 
 
 def test_whole_numbers_are_only_shapes_axes_and_indices(tmp_path):
-    assembly, params, _ = garment(tmp_path, "swing")
+    assembly, params, _ = garment("swing")
     export(assembly, params, tmp_path / "step.onnx")
     graph = onnx.shape_inference.infer_shapes(onnx.load(tmp_path / "step.onnx")).graph
     whole = {x.name for x in graph.initializer if x.data_type == onnx.TensorProto.INT64}
@@ -118,9 +118,9 @@ JOINTS = [2 * 9, 2 * 9, 2 * 3, 2 * 3]  # local and world rotations and positions
 @pytest.mark.parametrize(
     ("kind", "parts"), [("gated", [16, *JOINTS, 1]), ("linear", [16, *JOINTS, 1]), ("swing", [90, 90, 3, 3, 1]), ("pbns", [1])]
 )
-def test_the_state_holds_what_later_frames_need(tmp_path, kind, parts):
+def test_the_state_holds_what_later_frames_need(kind, parts):
     """Each part but the last, which is whether there was a frame, changes the vertices of this frame or of the next."""
-    assembly, params, _ = garment(tmp_path, kind)
+    assembly, params, _ = garment(kind)
     network, params = for_inference(assembly.network, params, assembly.model)
     call, arguments = flat_step(assembly.model, network, params)
     assert arguments == {"state": (sum(parts),), "rotations": (2, 3, 3), "translation": (3,), "alpha": (1,)}
@@ -138,7 +138,7 @@ def test_the_state_holds_what_later_frames_need(tmp_path, kind, parts):
 
 
 def test_the_first_frame_is_that_of_a_character_at_rest(tmp_path):
-    assembly, params, _ = garment(tmp_path, "gated")
+    assembly, params, _ = garment("gated")
     export(assembly, params, tmp_path / "step.onnx")
     motion = long()
     there = io.MotionRecord(motion.poses[100:102], motion.translation[100:102], 30.0, ())
@@ -204,7 +204,7 @@ def test_a_descriptor_without_rules_is_refused(tmp_path):
 
 @pytest.mark.parametrize("options", [{"rank": 3}, {"float16": True}, {"rank": 3, "float16": True}])
 def test_smaller_files_tell_their_error(tmp_path, options):
-    assembly, params, motion = garment(tmp_path, "gated")
+    assembly, params, motion = garment("gated")
     run, name = Run(assembly, params), next(iter(assembly.motions))
     whole = run.export(tmp_path / "whole.onnx")
     made = run.export(tmp_path / "smaller.onnx", **options)
@@ -218,7 +218,7 @@ def test_smaller_files_tell_their_error(tmp_path, options):
 
 
 def test_what_cannot_be_written(tmp_path):
-    assembly, params, _ = garment(tmp_path, "pbns")
+    assembly, params, _ = garment("pbns")
     run = Run(assembly, params)
     for options, words in (
         ({"format": "tflite"}, "--format: one of onnx, stablehlo expected .found 'tflite'."),
@@ -237,7 +237,7 @@ def test_what_cannot_be_written(tmp_path):
 
 
 def test_without_a_runtime_nothing_is_checked(tmp_path, monkeypatch):
-    assembly, params, _ = garment(tmp_path, "pbns")
+    assembly, params, _ = garment("pbns")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     made = Run(assembly, params).export(tmp_path / "step.onnx")
     assert made.check is None and "not checked" in str(made) and made.file.exists()
@@ -263,7 +263,7 @@ print(sorted(exported.platforms), exported.mlir_module().count("stablehlo.custom
 
 @pytest.mark.parametrize("float16", [False, True])
 def test_stablehlo_runs_with_jax_alone(tmp_path, float16):
-    assembly, params, _ = garment(tmp_path, "gated")
+    assembly, params, _ = garment("gated")
     motion, run = long(40), Run(assembly, params)
     made = run.export(tmp_path / "step", format="stablehlo", float16=float16)
     assert made.check.max_difference < 1e-5 and (made.check.error is not None) == float16
@@ -277,7 +277,7 @@ def test_stablehlo_runs_with_jax_alone(tmp_path, float16):
 
 
 def test_the_facts_say_what_a_host_has_to_know(tmp_path):
-    assembly, params, _ = garment(tmp_path, "gated")
+    assembly, params, _ = garment("gated")
     for format in FORMATS:
         made = export(assembly, params, tmp_path / f"step.{format}", FileFormat(format))
         facts = json.loads((tmp_path / f"step.{format}.json").read_text())
@@ -287,7 +287,7 @@ def test_the_facts_say_what_a_host_has_to_know(tmp_path):
     assert facts["alpha"] == {"from": 0.0, "trained": 1.0} and facts["outputs"]["vertices"]["shape"] == [30, 3]
     assert [(joint["number"], joint["parent"]) for joint in facts["joints"]] == [(0, -1), (1, 0)]
     np.testing.assert_allclose([joint["rest"] for joint in facts["joints"]], post()["joints"], atol=1e-6)
-    pose = garment(tmp_path, "pbns")
+    pose = garment("pbns")
     assert export(pose[0], pose[1], tmp_path / "step.onnx").facts["alpha"] is None
 
 
@@ -328,7 +328,7 @@ def host(folder, *arguments):
 
 
 def test_a_host_without_jax_plays_what_the_run_animates(tmp_path):
-    assembly, params, _ = garment(tmp_path, "gated")
+    assembly, params, _ = garment("gated")
     run = Run(assembly, params)
     run.export(tmp_path / "step.onnx")
     done = host(tmp_path, "step.onnx", "swing.npz", "out.npy", "1.5")

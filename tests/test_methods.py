@@ -21,16 +21,15 @@ from ncs_jax.prepare.build import features_from_records
 from ncs_jax.scene.model import local_rotations
 from ncs_jax.scene.spec import load_scene, scene_from
 
+from .ready import edited, lowered, prepared, ready, run, scopes
 from .scenes import write_scene
-from .test_rollout import edited, ready, run
-from .test_training import lowered, prepared, scopes
 
 METHODS = {"ncs": NCS, "pbns": PBNS, "snug": SNUG, "swing": Swing}
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, method):
-    assembly, params, motion = ready(tmp_path, method=method)
+def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(method):
+    assembly, params, motion = ready(method=method)
     network = assembly.network
     assert isinstance(network, METHODS[method]) and isinstance(network, Method)
     track = features_from_records(assembly.model, motion)
@@ -46,8 +45,8 @@ def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(tmp_path, m
 
 
 @pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])  # a swing is of the whole motion
-def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method):
-    assembly, params, motion = ready(tmp_path, method=method)
+def test_a_window_that_reaches_back_to_the_start_is_the_motion(method):
+    assembly, params, motion = ready(method=method)
     track, ends = features_from_records(assembly.model, motion), jnp.array([5, 9], jnp.int32)
     whole = assembly.network.codes(params, assembly.model, track)
     for of_all, of_windows in zip(whole, assembly.network.windows(params, track, ends, 10, 3), strict=True):
@@ -59,9 +58,9 @@ def test_a_window_that_reaches_back_to_the_start_is_the_motion(tmp_path, method)
         np.testing.assert_allclose(assembly.network.windows(params, track, ends, 10, 3)[0][:, 0], whole[0][3:6], atol=1e-13)
 
 
-def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap(tmp_path):
+def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap():
     """Of two motions end to end, the second from rest again; of many frames and few windows, from the windows alone."""
-    assembly, params, motion = ready(tmp_path, cell="linear")
+    assembly, params, motion = ready(cell="linear")
     once = assembly.network.codes(params, assembly.model, features_from_records(assembly.model, motion)).dynamic
     track, frames = features_from_records(assembly.model, motion, motion), len(once)
     ends = jnp.arange(2 * frames, dtype=jnp.int32)
@@ -75,24 +74,24 @@ def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap(t
     assert np.abs(few[0, 0] - once[-1]).max() > 1e-6
 
 
-def test_a_pose_alone_decides_with_pbns_and_not_with_the_others(tmp_path):
+def test_a_pose_alone_decides_with_pbns_and_not_with_the_others():
     for method in METHODS:
-        assembly, params, motion = ready(tmp_path, method=method)
+        assembly, params, motion = ready(method=method)
         backwards = edited(motion, motion.poses[::-1], motion.translation[::-1])
         apart = np.abs(run(assembly, params, motion) - run(assembly, params, backwards)[::-1]).max()
         assert apart < 1e-12 if method == "pbns" else apart > 1e-4
 
 
-def test_alpha_is_for_ncs_alone(tmp_path):
+def test_alpha_is_for_ncs_alone():
     for method in METHODS:
-        assembly, params, motion = ready(tmp_path, method=method)
+        assembly, params, motion = ready(method=method)
         apart = np.abs(run(assembly, params, motion, 2.0) - run(assembly, params, motion, 1.0)).max()
         assert (apart > 1e-4) == assembly.network.controlled == (method in ("ncs", "swing"))
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_only_a_swing_tells_the_motions_anything(tmp_path, method):
-    assembly, params, motion = ready(tmp_path, method=method)
+def test_only_a_swing_tells_the_motions_anything(method):
+    assembly, params, motion = ready(method=method)
     features = features_from_records(assembly.model, motion)
     told = jax.eval_shape(lambda f: jax.tree.leaves(assembly.network.refresh(params, assembly.model, f)), features)
     more = [leaf.shape for leaf in told[len(jax.tree.leaves(features)) :]]
@@ -100,8 +99,8 @@ def test_only_a_swing_tells_the_motions_anything(tmp_path, method):
     assert not more or more == [(len(motion.poses), assembly.network.modes)]
 
 
-def test_snug_sees_the_roots_motion(tmp_path):
-    assembly, params, motion = ready(tmp_path, method="snug")
+def test_snug_sees_the_roots_motion():
+    assembly, params, motion = ready(method="snug")
     t = np.arange(len(motion.poses))
     faster = edited(motion, motion.poses, motion.translation + 0.01 * t[:, None] ** 2 * [[1.0, 0, 0]])
     apart = run(assembly, params, faster) - run(assembly, params, motion)
@@ -109,9 +108,9 @@ def test_snug_sees_the_roots_motion(tmp_path):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_where_inertia_has_a_gradient(tmp_path, method, rng):
+def test_where_inertia_has_a_gradient(method, rng):
     """By x_{t-1} and x_{t-2} exactly none with NCS, the whole of it with SNUG; PBNS and a swing are trained without."""
-    assembly, _, _ = ready(tmp_path, method=method)
+    assembly, _, _ = ready(method=method)
     model = assembly.model
     terms = assembly.network.loss(Terms(None, bending=False, collision=None))
     x = model.garment.mesh.rest[None] + jnp.asarray(rng.normal(0, 0.01, (3, *model.garment.mesh.rest.shape)))
@@ -128,8 +127,8 @@ def test_where_inertia_has_a_gradient(tmp_path, method, rng):
         np.testing.assert_allclose(slope[k], share[k] * mass * away - (weight if k == 0 else 0), rtol=1e-9, atol=1e-12)
 
 
-def test_pbns_traces_no_inertia(tmp_path, plain_jax):
-    assembly, spec, ends, pairs = prepared(tmp_path, {"network.method": "pbns"})
+def test_pbns_traces_no_inertia(plain_jax):
+    assembly, spec, ends, pairs = prepared({"network.method": "pbns"})
     text = lowered(assembly, spec, ends, pairs)
     assert "inertia" not in scopes(text) and not re.search("DynamicEncoder", text)
     assert assembly.model.terms.inertia  # by which it is still judged

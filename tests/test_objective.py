@@ -13,11 +13,12 @@ import pytest
 from ncs_jax.energies.contact.pairs import groups_from
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.elements import elastic
-from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.energies.terms import MEMBRANES, Garment, StepInputs, Terms
 from ncs_jax.energies.total import distances, energies, total
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.skinning import unpose
 
+from .materials import DOWN, material
 from .shapes import ball, rotation, sheet
 
 ALL = Terms(collision="plane", pinning=True, self_contact=True)
@@ -25,24 +26,6 @@ NAMES = ("membrane", "bending", "collision", "gravity", "inertia", "pinning", "s
 OFF = {"membrane": None, "bending": False, "collision": None, "gravity": False, "inertia": False, "pinning": False}
 OFF["self_contact"] = False
 DT = 0.02
-DOWN = (0.0, 0.0, -9.81)
-
-
-def material(model="stvk", gravity=DOWN):
-    array = jnp.asarray
-    numbers = {"lam": 41.8, "mu": 22.2, "stretch": 40.0, "shear": 20.0, "stiffness": 60.0}
-    return Material(
-        density=array(0.15),
-        membrane=tuple(array(numbers[n]) for n in MEMBRANES[model][1]) if model else (),
-        bending=array(1e-5),
-        collision=array(10.0),
-        thickness=array(0.004),
-        friction=array(0.0),
-        pinning=array(1000.0),
-        gravity=array(gravity),
-        self_contact=array(50.0),
-        self_thickness=array(0.009),  # nearly a spacing, so that what is crumpled is too near
-    )
 
 
 @cache

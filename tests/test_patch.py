@@ -18,8 +18,7 @@ from ncs_jax.simulation.solver import problem as frame
 from ncs_jax.simulation.solver.patch import SIZE, patch_around, solve_dense
 
 from .scenes import grid
-from .test_simulator import written
-from .test_stiffness import dense
+from .simulators import dense, written
 from .verification.newton import QUICK
 
 evaluated = jax.jit(frame.evaluate, compiler_options=QUICK)

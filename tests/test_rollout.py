@@ -6,54 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ncs_jax import io
 from ncs_jax.network.methods.method import decode, for_inference, initial_parameters
-from ncs_jax.network.rollout import animate, stepper
+from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations
-from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.scene.spec import scene_from
 
-from .scenes import write_scene
-
-
-def shaken(params, key=1):
-    """Parameters far from their start, biases and modal coefficients included."""
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.PRNGKey(key), len(leaves))
-    moved = [p + 0.1 * jax.random.normal(k, p.shape, p.dtype) for p, k in zip(leaves, keys, strict=True)]
-    return jax.tree.unflatten(tree, moved)
+from .ready import animated, assembled, edited, ready, run, shaken
 
 
-def ready(folder, dtype=jnp.float64, method="ncs", cell="gated"):
-    tables = load_scene(write_scene(folder)).to_dict()
-    if method == "swing":  # cloth that hangs on something
-        method = "ncs"
-        cell, tables["garment"]["pins"], tables["network"]["vibrations"] = "swing", "pins", 3
-    tables["network"] |= {"method": method, "cell": cell}
-    assembly = assemble(scene_from(tables), dtype=dtype)
-    params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))
-    params = jax.tree.map(lambda p: p.astype(dtype), params)
-    return assembly, params, next(iter(assembly.motions.values()))
-
-
-def run(assembly, params, motion, alpha=1.0):
-    track = features_from_records(assembly.model, motion)
-    return np.asarray(jax.jit(animate, static_argnums=1)(assembly.model, assembly.network, params, track, alpha))
-
-
-def edited(motion, poses=None, translation=None):
-    return io.MotionRecord(
-        motion.poses if poses is None else poses,
-        motion.translation if translation is None else translation,
-        motion.fps,
-        motion.joint_names,
-    )
-
-
-def test_no_motion_has_no_dynamics(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def test_no_motion_has_no_dynamics():
+    assembly, params, motion = ready()
     still = edited(motion, np.repeat(motion.poses[3:4], 12, axis=0), np.repeat(motion.translation[3:4], 12, axis=0))
     moving, static = run(assembly, params, still, 1.0), run(assembly, params, still, 0.0)
     assert np.array_equal(moving, static)
@@ -61,15 +26,15 @@ def test_no_motion_has_no_dynamics(tmp_path):
     assert not np.array_equal(run(assembly, params, motion, 1.0), run(assembly, params, motion, 0.0))
 
 
-def test_alpha_zero_is_the_static_result(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def test_alpha_zero_is_the_static_result():
+    assembly, params, motion = ready()
     track = features_from_records(assembly.model, motion)
-    static = jax.jit(animate, static_argnums=(1, 4))(assembly.model, assembly.network, params, track, None)
+    static = animated(assembly.model, assembly.network, params, track, None)
     np.testing.assert_allclose(run(assembly, params, motion, 0.0), static, rtol=0, atol=1e-14)
 
 
-def test_prepended_rest_changes_nothing(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def test_prepended_rest_changes_nothing():
+    assembly, params, motion = ready()
     longer = edited(
         motion,
         np.concatenate([np.repeat(motion.poses[:1], 9, axis=0), motion.poses]),
@@ -78,8 +43,8 @@ def test_prepended_rest_changes_nothing(tmp_path):
     np.testing.assert_allclose(run(assembly, params, longer)[9:], run(assembly, params, motion), rtol=0, atol=1e-13)
 
 
-def test_a_stopped_character_comes_to_the_static_result(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def test_a_stopped_character_comes_to_the_static_result():
+    assembly, params, motion = ready()
     stopped = edited(
         motion,
         np.concatenate([motion.poses, np.repeat(motion.poses[-1:], 80, axis=0)]),
@@ -91,8 +56,8 @@ def test_a_stopped_character_comes_to_the_static_result(tmp_path):
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.5])
-def test_a_stream_gives_what_the_sequence_gives(tmp_path, plain_jax, alpha):
-    assembly, params, motion = ready(tmp_path, jnp.float32)
+def test_a_stream_gives_what_the_sequence_gives(plain_jax, alpha):
+    assembly, params, motion = ready(jnp.float32)
     init, step = stepper(assembly.model, assembly.network, params)
     step = jax.jit(step)
     local = local_rotations(assembly.model, jnp.asarray(motion.poses))
@@ -103,10 +68,10 @@ def test_a_stream_gives_what_the_sequence_gives(tmp_path, plain_jax, alpha):
     np.testing.assert_allclose(np.stack(frames), run(assembly, params, motion, alpha), rtol=0, atol=1e-6)
 
 
-def test_many_characters_move_by_themselves(tmp_path, monkeypatch):
+def test_many_characters_move_by_themselves(monkeypatch):
     """Five who begin at different frames, each with an alpha of its own, in blocks that do not divide them."""
     monkeypatch.setattr("ncs_jax.network.rollout.BLOCK", 2)
-    assembly, params, motion = ready(tmp_path)
+    assembly, params, motion = ready()
     init, step = stepper(assembly.model, assembly.network, params)
     step = jax.jit(step)
     rotations = local_rotations(assembly.model, jnp.asarray(motion.poses, jnp.float64))
@@ -122,8 +87,8 @@ def test_many_characters_move_by_themselves(tmp_path, monkeypatch):
         np.testing.assert_allclose(dict(jax.tree.leaves_with_path(crowd))[name], leaf, rtol=0, atol=1e-13)
 
 
-def test_one_linear_map_for_inference(tmp_path):
-    assembly, params, _ = ready(tmp_path)
+def test_one_linear_map_for_inference():
+    assembly, params, _ = ready()
     model, network = assembly.model, assembly.network
     z = jax.random.normal(jax.random.PRNGKey(2), (7, network.static.sizes[-1]), jnp.float64)
     merged, merged_params = for_inference(network, params, model)
@@ -140,17 +105,15 @@ def turned(motion, root, angle, root_joint=0):
     return edited(motion, poses, translation), turn.as_matrix()
 
 
-def test_turning_the_world_turns_the_prediction(tmp_path):
-    assembly, params, motion = ready(tmp_path)
+def test_turning_the_world_turns_the_prediction():
+    assembly, params, motion = ready()
     other, turn = turned(motion, assembly.body.joints[0], np.radians(73))
     here, there = run(assembly, params, motion), run(assembly, params, other)
     np.testing.assert_allclose(there, here @ turn.T, rtol=0, atol=1e-9)
 
 
-def test_the_published_descriptor_lacks_that(tmp_path):
-    tables = load_scene(write_scene(tmp_path)).to_dict()
-    tables["network"]["descriptor"] = "six"
-    assembly = assemble(scene_from(tables), dtype=jnp.float64)
+def test_the_published_descriptor_lacks_that():
+    assembly = assembled({"network.descriptor": "six"}, jnp.float64)
     params = shaken(initial_parameters(assembly.network, jax.random.PRNGKey(0), assembly.model))
     motion = next(iter(assembly.motions.values()))
     other, turn = turned(motion, assembly.body.joints[0], np.radians(73))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from ncs_jax.energies.contact.safe_steps import free_share, swept_share, yieldin
 from ncs_jax.energies.contact.self_contact import barrier, blocks, energy, gradient, product, repulsion, self_contact
 from ncs_jax.geometry.mesh import mesh_from
 
+from .conftest import OPTIMISED
 from .shapes import rotation, sheet, tube
 
 EPS, K = 0.003, 50.0
@@ -323,20 +324,20 @@ def test_the_energy_has_no_steps():
     move = np.zeros_like(x)
     move[half:] = [0.008, 0.003, -0.0045]
 
-    @jax.jit
     def value(t):
         there = jnp.asarray(x) + t * jnp.asarray(move)
         pairs = nearby_pairs(there, mesh, groups, EPS)
         return self_contact(there, pairs, EPS, K), jnp.sum(pairs.rest > 0), pairs.overflow
 
-    path = np.linspace(0, 1, 101)
-    values, counts, overflow = jax.lax.map(value, jnp.asarray(path))
+    along = jax.jit(partial(jax.lax.map, value), compiler_options=OPTIMISED)
+    path = np.linspace(0, 1, 201)
+    values, counts, overflow = along(jnp.asarray(path))
     assert not overflow.any()
     assert len(np.unique(np.asarray(counts))) > 20  # pairs come and go on the way
     for start in path[np.argsort(-np.abs(np.diff(values, 2)))[:2]]:
         for length in (2e-2, 2e-4, 2e-6):  # looked at ever closer, a step stays and a slope does not
             part = start + length * np.linspace(0, 1, 201)
-            values = np.asarray(jax.lax.map(value, jnp.asarray(part))[0])
+            values = np.asarray(along(jnp.asarray(part))[0])
             start = part[max(np.argmax(np.abs(np.diff(values))) - 1, 0)]
         # all pairs at once may pull with -B'(0) k eps; one that came or went with a step would make one of about k eps^2
         steepest = -float(barrier(jnp.zeros(1))[1][0]) * K * EPS * np.linalg.norm(move[-1]) * float(counts.max())

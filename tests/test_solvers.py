@@ -19,7 +19,7 @@ from ncs_jax.simulation.solver.minimise import CONVERGED, LIMIT, Settings
 
 from .scenes import SCENE, grid, write_scene
 from .shapes import tube
-from .test_simulator import sleeve, thrown, written
+from .simulators import sleeve, thrown, written
 
 pytestmark = pytest.mark.slow
 

@@ -19,8 +19,9 @@ from ncs_jax.geometry.skinning import skin
 from ncs_jax.simulation.solver.contact import evaluate_contact
 from ncs_jax.simulation.solver.stiffness import couplings_from, multiply, stiffness
 
+from .materials import material
 from .shapes import ball, rotation, sheet, tube
-from .test_objective import material
+from .simulators import dense
 from .verification.newton import QUICK
 
 NOTHING = Terms(membrane=None, bending=False, collision=None, gravity=False, inertia=False)
@@ -54,16 +55,6 @@ def blocks(x, couplings, cloth, numbers, frame, terms, surface=None):
 def hessian(x, cloth, numbers, frame, terms, surface=None):
     whole = jax.hessian(lambda x: total(x, cloth, numbers, frame, terms, surface))(x)
     return whole.reshape(x.size, x.size)
-
-
-def dense(couplings, diagonal, off):
-    n = len(diagonal)
-    a = np.zeros((n, 3, n, 3))
-    a[np.arange(n), :, np.arange(n)] = diagonal
-    for (i, j), block in zip(np.asarray(couplings.pairs), np.asarray(off), strict=True):
-        assert i < j and not a[i, :, j].any()  # a pair is there once
-        a[i, :, j], a[j, :, i] = block, block.T
-    return a.reshape(3 * n, 3 * n)
 
 
 def assembled(x, shape, terms, *, numbers=None, frame=None, surface=None, seed=None):

@@ -23,9 +23,8 @@ from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 from ncs_jax.training.loss import gradients
 from ncs_jax.training.step import Task, initial_state, windows_of
 
+from .ready import edited, prepared, ready, run
 from .scenes import grid, write_scene
-from .test_rollout import edited, ready, run
-from .test_training import prepared
 
 SWING = {"network.cell": "swing", "network.vibrations": 3, "garment.pins": "pins", "training.motion_augmentation": 0.5}
 
@@ -78,9 +77,9 @@ def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
     assert np.all(np.diff(np.diag(moved)) < 0)  # softest first
 
 
-def test_a_swing_is_implicit_euler_along_the_vibrations(tmp_path):
+def test_a_swing_is_implicit_euler_along_the_vibrations():
     """Every frame minimises inertia about its own two frames before, and the energy of the vibrations."""
-    assembly, params, motion = ready(tmp_path, method="swing")
+    assembly, params, motion = ready(method="swing")
     model, network, track = (
         assembly.model,
         replace(assembly.network, damping=0.0),
@@ -99,8 +98,8 @@ def test_a_swing_is_implicit_euler_along_the_vibrations(tmp_path):
         np.testing.assert_allclose(force, 0, atol=1e-9 * float(model.vibrations.energy))
 
 
-def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped(tmp_path):
-    assembly, params, motion = ready(tmp_path, method="swing")
+def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped():
+    assembly, params, motion = ready(method="swing")
     still = 300
     poses, places = (np.concatenate([a, np.repeat(a[-1:], still, axis=0)]) for a in (motion.poses, motion.translation))
     track, model = features_from_records(assembly.model, edited(motion, poses, places)), assembly.model
@@ -114,8 +113,8 @@ def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped(tmp_pat
     assert left[1] < 0.5 * left[0] < 0.5
 
 
-def test_no_motion_no_swing_and_motions_end_to_end_know_nothing_of_each_other(tmp_path):
-    assembly, params, motion = ready(tmp_path, method="swing")
+def test_no_motion_no_swing_and_motions_end_to_end_know_nothing_of_each_other():
+    assembly, params, motion = ready(method="swing")
     model, network = assembly.model, assembly.network
     still = edited(motion, np.repeat(motion.poses[3:4], 40, axis=0), np.repeat(motion.translation[3:4], 40, axis=0))
     codes = network.codes(params, model, features_from_records(model, still))
@@ -125,8 +124,8 @@ def test_no_motion_no_swing_and_motions_end_to_end_know_nothing_of_each_other(tm
     np.testing.assert_allclose(every, jnp.concatenate([once, jnp.zeros((40, 3)), once]), rtol=0, atol=1e-12)
 
 
-def test_alpha_scales_the_swing_and_the_code_that_goes_with_it(tmp_path):
-    assembly, params, motion = ready(tmp_path, method="swing")
+def test_alpha_scales_the_swing_and_the_code_that_goes_with_it():
+    assembly, params, motion = ready(method="swing")
     network, codes = (
         assembly.network,
         assembly.network.codes(params, assembly.model, features_from_records(assembly.model, motion)),
@@ -137,8 +136,8 @@ def test_alpha_scales_the_swing_and_the_code_that_goes_with_it(tmp_path):
     assert moved[1] > 1.3 * moved[0] > 1e-3
 
 
-def test_far_from_the_origin_a_stream_in_single_precision_swings_as_near_it(tmp_path):
-    assembly, params, motion = ready(tmp_path, jnp.float32, "swing")
+def test_far_from_the_origin_a_stream_in_single_precision_swings_as_near_it():
+    assembly, params, motion = ready(jnp.float32, "swing")
     model = assembly.model
     init, step = stepper(model, assembly.network, params)
     local, step = local_rotations(model, jnp.asarray(motion.poses, jnp.float32)), jax.jit(step)
@@ -151,9 +150,9 @@ def test_far_from_the_origin_a_stream_in_single_precision_swings_as_near_it(tmp_
     assert np.abs(ends[1] - ends[0]).max() < 1e-3  # 1,024 m has no places finer than 0.06 mm
 
 
-def test_the_gradient_is_that_of_the_energy_and_of_what_holds(tmp_path):
+def test_the_gradient_is_that_of_the_energy_and_of_what_holds():
     """Of all that a step computes in pieces, in one: with other frames' swings too."""
-    assembly, spec, ends, _ = prepared(tmp_path, SWING, jnp.float64)
+    assembly, spec, ends, _ = prepared(SWING, jnp.float64)
     model, network, ends = assembly.model, assembly.network, ends[0]
     params = initial_state(model, network, 0).params
     params["dynamic"]["read"]["kernel"] = params["dynamic"]["read"]["kernel"] * 100

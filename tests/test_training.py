@@ -1,7 +1,6 @@
 """The training step: what it differentiates, what it leaves out, and what it does with numbers that are not finite."""
 
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
@@ -12,41 +11,20 @@ from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import energies
 from ncs_jax.geometry.skinning import blend, skin
-from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import pose_body
-from ncs_jax.scene.spec import load_scene, scene_from
+from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.batches import CHUNK, batches, chunks
-from ncs_jax.training.loss import gradients, physics, with_bodies
+from ncs_jax.training.loss import physics, with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
-from ncs_jax.training.step import Task, chunk_runner, initial_state, step_size, windows_of
+from ncs_jax.training.step import chunk_runner, initial_state, step_size
 
+from .ready import TERMS, lowered, one_gradient, prepared, scopes
 from .scenes import write_scene
 
 
-def prepared(folder, changes=(), dtype=jnp.float32):
-    tables = load_scene(write_scene(folder)).to_dict()
-    for path, value in dict(changes).items():
-        *parents, last = path.split(".")
-        table = tables
-        for name in parents:
-            table = table[name]
-        table[last] = value
-    assembly = assemble(scene_from(tables), dtype=dtype)
-    spec = assembly.scene.training
-    ends = jnp.asarray(batches(assembly.track.start.shape[0], spec.batch, 0, 0, CHUNK))
-    return assembly, spec, ends, jnp.zeros_like(ends)
-
-
-def one_gradient(assembly, spec, params, ends, pairs):
-    def f(model, params, track):
-        return gradients(model, assembly.network, params, track, windows_of(Task(model, assembly.network, spec), ends, pairs))
-
-    return jax.jit(f)(assembly.model, params, assembly.track)
-
-
-def test_single_precision_energies_agree_with_a_plain_double_precision_reference(tmp_path, rng):
+def test_single_precision_energies_agree_with_a_plain_double_precision_reference(rng):
     """The batched path in float32 against every term of one pose after the other in float64, with every pair searched."""
-    assembly, _, ends, _ = prepared(tmp_path)
+    assembly, _, ends, _ = prepared()
     model, track, poses = assembly.model, assembly.track, np.asarray(ends[0])
     back = np.maximum(poses[None] - np.arange(3)[:, None], 0)
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
@@ -76,7 +54,7 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
 
 
 @pytest.mark.parametrize("method", ["ncs", "pbns", "snug"])
-def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
+def test_the_step_is_the_derivative_of_the_mean_energy(method):
     """Against automatic differentiation of the whole chain: x_{t-1} and x_{t-2} are constants to NCS, and not to SNUG."""
     from ncs_jax.energies.terms import StepInputs
     from ncs_jax.energies.total import total
@@ -84,7 +62,7 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
     from ncs_jax.network.methods.method import decode
     from ncs_jax.scene.model import pose_body
 
-    assembly, spec, ends, pairs = prepared(tmp_path, {"network.method": method}, dtype=jnp.float64)
+    assembly, spec, ends, pairs = prepared({"network.method": method}, dtype=jnp.float64)
     model, network, track = assembly.model, assembly.network, assembly.track
     hold = (lambda x: x) if method == "snug" else jax.lax.stop_gradient
     terms = network.loss(model.terms)
@@ -117,21 +95,6 @@ def test_the_step_is_the_derivative_of_the_mean_energy(tmp_path, method):
     assert all(float(jnp.abs(b).max()) > 0 for b in jax.tree.leaves(expected))
 
 
-TERMS = ("membrane", "bending", "collision", "gravity", "inertia", "pinning")
-
-
-def lowered(assembly, spec, ends, pairs):
-    state = initial_state(assembly.model, assembly.network, 0)
-    runner = chunk_runner(assembly.network, spec)
-    # Plain leaves: JAX fills the containers of a lowered program's arguments with what is not an array.
-    leaves, tree = jax.tree.flatten((state, ends, pairs, 10, assembly.model, assembly.track))
-    return jax.jit(lambda *leaves: runner(*jax.tree.unflatten(tree, leaves))).lower(*leaves).as_text(debug_info=True)
-
-
-def scopes(text):
-    return {t for t in TERMS if re.search(rf'["/(]{t}\)?/', text)}
-
-
 @pytest.mark.parametrize(
     ("changes", "absent"),
     [
@@ -147,8 +110,8 @@ def scopes(text):
         ({"body.file": "none", "motion.files": [], "motion.validation": []}, {"collision", "inertia", "pinning"}),
     ],
 )
-def test_what_a_scene_lacks_is_not_traced(tmp_path, plain_jax, changes, absent):
-    assembly, spec, ends, pairs = prepared(tmp_path, changes)
+def test_what_a_scene_lacks_is_not_traced(plain_jax, changes, absent):
+    assembly, spec, ends, pairs = prepared(changes)
     text = lowered(assembly, spec, ends, pairs)
     assert scopes(text) == set(TERMS) - absent
     still = changes.get("motion.files") == []
@@ -156,8 +119,8 @@ def test_what_a_scene_lacks_is_not_traced(tmp_path, plain_jax, changes, absent):
     assert ("dynamic" in initial_state(assembly.model, assembly.network, 0).params) == (not still)
 
 
-def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path, monkeypatch):
-    assembly, spec, ends, pairs = prepared(tmp_path)
+def test_a_body_posed_once_for_all_frames_gives_the_same_step(monkeypatch):
+    assembly, spec, ends, pairs = prepared()
     params = initial_state(assembly.model, assembly.network, 0).params
     track = with_bodies(assembly.model, assembly.track, 3)
     assert track.bodies.shape == (len(track.start), len(assembly.model.body), 6)
@@ -172,8 +135,8 @@ def test_a_body_posed_once_for_all_frames_gives_the_same_step(tmp_path, monkeypa
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * size)
 
 
-def test_energy_falls(tmp_path, plain_jax):
-    assembly, spec, _, _ = prepared(tmp_path)
+def test_energy_falls(plain_jax):
+    assembly, spec, _, _ = prepared()
     run = chunk_runner(assembly.network, spec)
     state, energy = initial_state(assembly.model, assembly.network, 0), []
     for first, count in chunks(0, 60):
@@ -186,8 +149,8 @@ def test_energy_falls(tmp_path, plain_jax):
     assert 0 <= float(seen["strain"]) < 20 and 0 <= float(seen["penetrating"]) <= 100
 
 
-def test_a_step_that_is_not_finite_is_dropped_counted_and_named(tmp_path, plain_jax):
-    assembly, spec, ends, pairs = prepared(tmp_path)
+def test_a_step_that_is_not_finite_is_dropped_counted_and_named(plain_jax):
+    assembly, spec, ends, pairs = prepared()
     model = assembly.model
     run = chunk_runner(assembly.network, spec)
     state = initial_state(model, assembly.network, 0)
@@ -208,10 +171,10 @@ def test_a_step_that_is_not_finite_is_dropped_counted_and_named(tmp_path, plain_
     assert not all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params), strict=True))
 
 
-def test_cloth_that_comes_too_near_itself_is_pushed_apart(tmp_path, plain_jax):
+def test_cloth_that_comes_too_near_itself_is_pushed_apart(plain_jax):
     """A sheet folded over itself in unposed space; and a training step of a scene that has self-contact is finite."""
     changes = {"physics.self_contact.stiffness": 50.0, "physics.self_contact.thickness": 0.02}
-    assembly, spec, ends, pairs = prepared(tmp_path, changes)
+    assembly, spec, ends, pairs = prepared(changes)
     model = assembly.model
     rest = np.asarray(model.garment.mesh.rest)
     fold = np.where(rest[:, :1] > 0.02, -2 * rest[:, :1] * [1, 0, 0] + [0.013, 0.017, 0.01], 0)
@@ -235,8 +198,8 @@ def test_cloth_that_comes_too_near_itself_is_pushed_apart(tmp_path, plain_jax):
     assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves((gradient, parts)))
 
 
-def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, plain_jax):
-    assembly, spec, ends, _ = prepared(tmp_path, {"training.motion_augmentation": 1.0})
+def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(plain_jax):
+    assembly, spec, ends, _ = prepared({"training.motion_augmentation": 1.0})
     params = initial_state(assembly.model, assembly.network, 0).params
     grads, parts, _ = one_gradient(assembly, spec, params, ends[0], jnp.roll(jnp.arange(spec.batch), 1))
     for name in ("static", "dynamic"):
@@ -245,10 +208,10 @@ def test_motion_augmentation_leaves_the_encoders_and_inertia_alone(tmp_path, pla
     assert np.all(np.asarray(parts["inertia"]) == 0)
 
 
-def test_learned_skinning_weights_get_a_gradient_and_stay_weights(tmp_path, plain_jax):
+def test_learned_skinning_weights_get_a_gradient_and_stay_weights(plain_jax):
     from ncs_jax.network.methods.method import garment_blend
 
-    assembly, spec, ends, pairs = prepared(tmp_path, {"garment.learn_weights": True})
+    assembly, spec, ends, pairs = prepared({"garment.learn_weights": True})
     run = chunk_runner(assembly.network, spec)
     state, _ = run(initial_state(assembly.model, assembly.network, 0), ends, pairs, 100, assembly.model, assembly.track)
     learned = garment_blend(assembly.network, state.params, assembly.model).weights

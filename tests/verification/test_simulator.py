@@ -20,7 +20,7 @@ from ncs_jax.simulation.solver.minimise import CONVERGED
 
 from ..scenes import grid
 from ..shapes import rotation
-from ..test_simulator import SETTINGS, TOLERANCE, advance, loose, thrown, written
+from ..simulators import SETTINGS, TOLERANCE, advance, loose, thrown, written
 from .newton import order
 
 pytestmark = pytest.mark.slow

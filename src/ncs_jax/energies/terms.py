@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 from jaxtyping import Array, Float, Int
@@ -50,6 +50,7 @@ NAMES = (
 )
 
 
+@runtime_checkable
 class OwnTerm(Protocol):
     """A term of one's own: a pure function `term(x, step)` that returns an energy in J and is differentiable by x.
 
