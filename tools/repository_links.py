@@ -1,7 +1,7 @@
 """The study as a page of the documentation, and links from the pages into the repository.
 
-A page links to a file as it lies in the repository, `../experiments/README.md` or `../notebooks/quickstart.ipynb`, so that the link
-also works where the repository is browsed. On the site these files are pages, which this hook makes and links to.
+A page links to a file as it lies in the repository, `../experiments/README.md` or `../notebooks/quickstart.ipynb`. So the
+link also works where the repository is browsed. On the site these files are pages, which this hook makes and links to.
 """
 
 import re
