@@ -1,7 +1,7 @@
 """Draw a trained garment over a motion as an animated GIF: the picture of the README.
 
     ncs train ncs:skirt --minutes 6 --out runs/skirt
-    python -m tools.make_gif runs/skirt docs/swing.gif --motion ncs:walk_turn_stop --frames 60 195
+    python -m tools.make_gif runs/skirt docs/swing.gif --motion ncs:dance --frames 30 210
 
 Takes half a minute. It is drawn at 15 frames per second, with fewer colours until it is below 3 MB.
 """
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.make_gif", description=__doc__.splitlines()[0])
     parser.add_argument("run", metavar="RUN", help="folder that ncs train made")
     parser.add_argument("out", metavar="FILE", help="the GIF")
-    parser.add_argument("--motion", default="ncs:walk_turn_stop", help="motion file or ncs:NAME (default: ncs:walk_turn_stop)")
+    parser.add_argument("--motion", default="ncs:dance", help="motion file or ncs:NAME (default: ncs:dance)")
     parser.add_argument("--frames", type=int, nargs=2, default=(0, None), metavar=("FIRST", "END"), help="of the motion")
     parser.add_argument("--alpha", type=float, default=1.0, help="how much the garment moves (default: 1)")
     parser.add_argument("--view", default="three-quarter", help="front, three-quarter, side or back")
