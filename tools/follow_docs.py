@@ -38,8 +38,11 @@ Frame Time: 0.033333
 """
 
 
-def follow(chosen: Sequence[Path]) -> list[str]:
-    """Run what the pages show, in their order, and return what went wrong, one line each."""
+def follow(chosen: Sequence[Path], *, experiments: bool = False) -> list[str]:
+    """Run what the pages show, in their order, and return what went wrong, one line each.
+
+    `experiments`: run these and the benchmarks too, which have tests of their own at their smallest size.
+    """
     found = []
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         furnish()
@@ -48,7 +51,7 @@ def follow(chosen: Sequence[Path]) -> list[str]:
             done: set[str] = set()
             for sample in samples(str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")):
                 again, _ = sample.text in done, done.add(sample.text)
-                if not again and (why := _followed(sample, names)) is not None:
+                if not again and (why := _followed(sample, names, experiments)) is not None:
                     print(f"{sample}{': ' if why else ''}{why}", flush=True)
                     found += [f"{sample}: {why}"] if why else []
     return found
@@ -104,7 +107,7 @@ def capture() -> str:
     return BVH % (inner, "\n".join(" ".join(map(str, row)) for row in rows))
 
 
-def _followed(sample: Sample, names: dict) -> str | None:
+def _followed(sample: Sample, names: dict, experiments: bool) -> str | None:
     """Run a sample; return what went wrong, empty where nothing did, None where it is not run."""
     try:
         if sample.kind == "python":
@@ -116,7 +119,7 @@ def _followed(sample: Sample, names: dict) -> str | None:
                 return ""
             return None
         if sample.kind == "sh" or not command_fault(next(iter(written_out(sample.text))), lenient=False):
-            return _run_command(sample)
+            return _run_command(sample, experiments)
     except (Exception, SystemExit) as error:  # whatever a reader would see
         return f"{type(error).__name__}: {error}"
     return None
@@ -137,7 +140,7 @@ def _run_python(sample: Sample, names: dict) -> str:
     return ""
 
 
-def _run_command(sample: Sample) -> str | None:
+def _run_command(sample: Sample, experiments: bool) -> str | None:
     if sample.text.startswith(("srun", "CUDA_VISIBLE_DEVICES")) or "--hosts" in sample.text:
         return None
     words = [NAMES.get(word, word) for word in next(iter(written_out(sample.text)))]
@@ -145,7 +148,10 @@ def _run_command(sample: Sample) -> str | None:
     if program == "make":
         return _shell(["make", "-n", *rest])
     if program == "python" and rest[0] == "-m":
-        return None if rest[1] in ("tests.test_cost", "tools.run_docs") else _module(rest[1:])
+        tested = rest[1].startswith("tests.") or rest[1] == "tools.run_docs"
+        if not experiments:
+            tested |= rest[1].startswith(("experiments", "benchmarks"))
+        return None if tested else _module(rest[1:])
     if program == "python":
         return _shell([sys.executable, *rest])
     if program != "ncs" or not rest:

@@ -230,6 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(prog="python -m tools.run_docs", description=__doc__.splitlines()[0])
     parser.add_argument("--run", action="store_true", help="really run them, at small sizes, in a temporary folder")
+    parser.add_argument("--experiments", action="store_true", help="with --run: these and the benchmarks too, an hour more")
     parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE", help="these pages (default: all)")
     o = parser.parse_args(arguments)
     chosen = [page.resolve() for page in o.pages]
@@ -237,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if o.run and not wrong:
         from tools.follow_docs import follow
 
-        wrong = follow(chosen or pages())
+        wrong = follow(chosen or pages(), experiments=o.experiments)
     print("\n".join(wrong) or f"{len(chosen or pages())} pages: good")
     return 1 if wrong else 0
 
