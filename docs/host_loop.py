@@ -10,7 +10,8 @@ The motion file holds three arrays:
     trans  (frames, 3)          where the root has moved from its place at rest, metres
     fps    ()                   frames per second
 
-The result, vertices.npy, has shape (frames, vertices, 3) and is in metres. A fourth argument is alpha: 0 is static, 1 as trained.
+The result, vertices.npy, has shape (frames, vertices, 3) and is in metres. A fourth argument is alpha: 0 is static, 1 as
+trained.
 
 An engine has rotation matrices already, so it needs no motion file and no `matrix`. An engine with left-handed axes mirrors
 rotations and translation before the step, and the vertices after it.
