@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from unittest import mock
@@ -121,7 +122,8 @@ def _followed(sample: Sample, names: dict, experiments: bool) -> str | None:
         if sample.kind == "sh" or not command_fault(next(iter(written_out(sample.text))), lenient=False):
             return _run_command(sample, experiments)
     except (Exception, SystemExit) as error:  # whatever a reader would see
-        return f"{type(error).__name__}: {error}"
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})"
     return None
 
 
@@ -154,7 +156,7 @@ def _run_command(sample: Sample, experiments: bool) -> str | None:
         return None if tested else _module(rest[1:])
     if program == "python":
         return _shell([sys.executable, *rest])
-    if program != "ncs" or not rest:
+    if program != "ncs" or not rest or "--help" in rest:
         return None
     return _viewed(rest) if rest[0] == "view" else _ncs(rest)
 

@@ -72,7 +72,7 @@ def _turned(model: Model, turn) -> Array:
 
     def energy(x):
         return sum(
-            energies(x, garment, model.material, StepInputs(blended=blended), terms).values(), start=jnp.zeros((), x.dtype)
+            energies(x, garment, model.material, StepInputs(vertex_transforms=blended), terms).values(), start=jnp.zeros((), x.dtype)
         )
 
     return jax.grad(energy)(skin(blended, rest))
