@@ -71,9 +71,8 @@ def _turned(model: Model, turn) -> Array:
     terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False)
 
     def energy(x):
-        return sum(
-            energies(x, garment, model.material, StepInputs(vertex_transforms=blended), terms).values(), start=jnp.zeros((), x.dtype)
-        )
+        step = StepInputs(vertex_transforms=blended)
+        return sum(energies(x, garment, model.material, step, terms).values(), start=jnp.zeros((), x.dtype))
 
     return jax.grad(energy)(skin(blended, rest))
 
