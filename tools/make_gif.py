@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 
 from ncs_jax import load_run
+from ncs_jax.view.character import animation_of
 from ncs_jax.view.pictures import animation_gif
-from ncs_jax.view.preview import posed_body
 
 SIZE = (400, 480)  # pixels
 LARGEST = 3_000_000  # bytes
@@ -29,15 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--alpha", type=float, default=1.0, help="how much the garment moves (default: 1)")
     parser.add_argument("--view", default="three-quarter", help="front, three-quarter, side or back")
     o = parser.parse_args(arguments)
-    run, shown = load_run(o.run), slice(*o.frames)
-    assembly = run.assembly
-    garment = run.animate(o.motion, o.alpha)[shown]
-    body = posed_body(assembly.body, run.motion(o.motion))[shown]
-    faces = assembly.garment.faces, assembly.body.faces
-    animation_gif(
-        o.out, garment, faces[0], body, faces[1], assembly.model.fps,
-        max_frames=len(garment), size=SIZE, view=o.view, max_bytes=LARGEST,
-    )  # fmt: skip
+    run = load_run(o.run)
+    first, end = o.frames
+    whole = animation_of(run.assembly, run.motion(o.motion), run.animate(o.motion, o.alpha)).until(end)
+    garment, body = whole.garment[first:], replace(whole.body, vertices=whole.body.vertices[first:])
+    shown = replace(whole, garment=garment, body=body)
+    animation_gif(o.out, shown, max_frames=len(garment), size=SIZE, view=o.view, max_bytes=LARGEST)
     print(f"{o.out}: {len(garment)} frames of {o.motion}, alpha {o.alpha:g}")
     return 0
 
