@@ -43,7 +43,7 @@ stability: .venv/installed
 
 # The documentation, into build/site. Warnings are errors.
 docs: .venv/ready
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build  # with --quiet it would neither show warnings nor fail on them
 
 lint: .venv/ready
 	$(BIN)/ruff check .

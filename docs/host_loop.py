@@ -1,9 +1,20 @@
-"""A host's loop: onnxruntime and NumPy play a garment that `ncs export` wrote over a motion file.
+"""Play an exported garment over a motion, with NumPy and onnxruntime alone: what a game engine does, in Python.
 
-    python host_loop.py tshirt.onnx walk.npz vertices.npy [ALPHA]
+    pip install numpy onnxruntime
+    ncs export runs/tshirt --out tshirt.onnx
+    python docs/host_loop.py tshirt.onnx src/ncs_jax/assets/walk.npz vertices.npy
 
-The motion has what `tshirt.onnx.json` asks for: `poses` (frames, joints, 3), axis-angle, and `trans` (frames, 3) in metres, at
-the file's frame rate. An engine takes matrices from its own skeleton instead; one with left-handed axes mirrors them first.
+The motion file holds three arrays:
+
+    poses  (frames, joints, 3)  how each joint of the body is turned: axis times angle, radians
+    trans  (frames, 3)          where the root has moved from its place at rest, metres
+    fps    ()                   frames per second
+
+The result, vertices.npy, has shape (frames, vertices, 3) and is in metres. A fourth argument is alpha: 0 is static, 1 as
+trained.
+
+An engine has rotation matrices already, so it needs no motion file and no `matrix`. An engine with left-handed axes mirrors
+rotations and translation before the step, and the vertices after it.
 """
 
 import json
@@ -13,31 +24,48 @@ import numpy as np
 import onnxruntime
 
 
-def matrices(poses):
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3)."""
-    angle = np.linalg.norm(poses, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(poses / np.maximum(angle[..., 0], 1e-12), -1, 0)
-    zero = np.zeros_like(x)
-    k = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+def matrix(turn):
+    """Return the rotation matrix (3, 3) of axis times angle (3,), by Rodrigues' formula."""
+    angle = np.linalg.norm(turn)
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = turn / angle  # the axis, of length 1
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])  # cross @ v is the cross product of the axis and v
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def main(model, motion, out, alpha="1"):
-    """Play a motion and save the vertices (frames, verts, 3)."""
+    """Play a motion and save the vertices (frames, vertices, 3)."""
     session = onnxruntime.InferenceSession(model)
+
+    # What a host has to know is inside the file, as JSON text. The same text lies beside it in tshirt.onnx.json.
     facts = json.loads(session.get_modelmeta().custom_metadata_map["ncs_jax"])
+    numbers = [joint["number"] for joint in facts["joints"]]  # the body's joints that the garment reads, in this order
+
     recording = np.load(motion)
-    if float(recording["fps"]) != facts["fps"]:
-        raise SystemExit(f"{motion}: {recording['fps']} frames per second; the garment was trained at {facts['fps']}")
-    rotations = matrices(recording["poses"])[:, [joint["number"] for joint in facts["joints"]]].astype(np.float32)
-    given = {"alpha": np.array([alpha], np.float32), "state": np.zeros(facts["inputs"]["state"]["shape"], np.float32)}
+    fps = float(recording["fps"])
+    if fps != facts["fps"]:
+        raise SystemExit(f"{motion}: {fps} frames per second; the garment was trained at {facts['fps']}")
+
+    # The state is what the garment remembers of the frames before: one vector, zeros at the start of a motion.
+    state = np.zeros(facts["inputs"]["state"]["shape"], np.float32)
+
     frames = []
-    for given["rotations"], given["translation"] in zip(rotations, recording["trans"].astype(np.float32), strict=True):
-        given["state"], vertices = session.run(["next_state", "vertices"], given)
-        frames.append(vertices)
+    for pose, place in zip(recording["poses"], recording["trans"], strict=True):
+        inputs = {
+            "state": state,  # (S,)
+            "rotations": np.array([matrix(pose[j]) for j in numbers], np.float32),  # (joints, 3, 3)
+            "translation": place.astype(np.float32),  # (3,), metres
+            "alpha": np.array([alpha], np.float32),  # (1,)
+        }
+        state, vertices = session.run(["next_state", "vertices"], inputs)  # the state goes into the next frame
+        frames.append(vertices)  # (vertices, 3), metres, in the order of the garment's own file
+
     np.save(out, frames)
     print(f"{out}: {len(frames)} frames of {facts['vertices']} vertices")
 
 
 if __name__ == "__main__":
+    if not 4 <= len(sys.argv) <= 5:
+        raise SystemExit(__doc__)
     main(*sys.argv[1:])

@@ -108,11 +108,11 @@ def mattered(results: Path) -> str:
     more = sum(apart > luck["distance"] for apart, _ in found)
     return f"""## What mattered
 
-By how much the choice that is nearest to the simulation differs from the one that is farthest from it. From seed to seed it is
-{mm}; {more} of {len(found)} differ by more. What moves after a stop, as a share of what the simulation moves there, differs by
-{stopped} from seed to seed.
+For each thing that can be chosen: how far the best and the worst choice are from the simulation. From seed to seed the distance
+differs by {mm}; {more} of {len(found)} choices make a larger difference. What moves after a stop, as a share of what the
+simulation moves there, differs by {stopped} from seed to seed.
 
-| what is chosen | nearest | farthest | mm | mm | apart, mm | energy of the farthest, % | moves after a stop |
+| what is chosen | best | worst | best, mm | worst, mm | difference, mm | energy of the worst, % | moves after a stop |
 |---|---|---|---|---|---|---|---|
 {lines}
 """
@@ -155,10 +155,10 @@ def repeated(results: Path) -> str:
     )
     return f"""## Repeated with other instructions of the processor
 
-One machine gives every number again, but for the times, to the last digit. One with other instructions rounds differently, and
-a training or a simulation that rounds differently goes its own way: so far apart is the row of each section that is farthest.
-The simulation's own settling is among these, and whatever is measured beside it moves with it. The pendulum is {here:.0f} mm
-from its simulation here, and {there:.0f} there.
+One machine gives every number again to the last digit, but for the times. A machine with other instructions rounds
+differently, and then a training or a simulation takes another path. The table shows, for each section, the row that differs
+most. The simulation's own settling differs too, and with it whatever is compared with it. The pendulum is {here:.0f} mm from
+its simulation here, and {there:.0f} mm there.
 
 | {" | ".join(["section", *(label for label, _ in REPEATED.values())])} |
 {"|---" * (1 + len(REPEATED))}|
@@ -172,13 +172,17 @@ def page(results: Path) -> str:
     steps = round(facts["steps"])
     head = f"""# The study
 
-Every claim of the method as an experiment on the packaged garments. All tables and pictures here are made by `make study`, in
-{facts["minutes"]:.0f} minutes. Every network is trained from one seed on the scene's motions without
-{" and ".join(f"`{name}`" for name in UNSEEN)}, on which all is measured, beside simulations with smooth contact, of
-which each frame is in balance to {BALANCE:g} g: for {LONG * steps:,} steps where methods stand side by side and for motion
-control, for {steps:,} elsewhere. A motion that ends standing is held for {STAND:g} s more. By how much such numbers differ from
-seed to seed says the section Spread. Minutes are by the clock: what else the machine does adds to them, such as a
-second network trained beside; milliseconds of a frame are of one network alone.
+Every claim of the method as an experiment on the packaged garments. `make study` makes all tables and pictures here, in
+{facts["minutes"]:.0f} minutes.
+
+- Every network is trained from one seed: for {LONG * steps:,} steps where methods stand side by side and for motion control,
+  for {steps:,} elsewhere.
+- It is trained on the scene's motions without {" and ".join(f"`{name}`" for name in UNSEEN)}. It is measured on these two.
+- It is compared with simulations with smooth contact, in which each frame is in balance to {BALANCE:g} g.
+- A motion that ends standing is held for {STAND:g} s more.
+- The section Spread says how much such numbers differ from seed to seed.
+- Minutes are by the clock. Other work on the machine adds to them, such as a second network that is trained at the same time.
+  Milliseconds of a frame are those of one network alone.
 """
     parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
     return "\n".join(filter(None, parts))

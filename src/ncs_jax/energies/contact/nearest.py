@@ -98,7 +98,7 @@ def _smallest(values, count):
 
 
 def nearest_groups(cloth, grouped, count):
-    """Return for every cloth group the squared gap of bounding boxes to the first group left out, and the `count` nearest groups."""
+    """Return the squared gap of bounding boxes to the first group left out, and the `count` nearest, for every cloth group."""
     corners = grouped.reshape(len(grouped), -1, 3)
     low, high = corners.min(axis=1), corners.max(axis=1)
     gap = jnp.maximum(jnp.maximum(low[None] - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high[None]), 0)
