@@ -51,7 +51,8 @@ def follow(chosen: Sequence[Path], *, experiments: bool = False) -> list[str]:
             names: dict = {}
             done: set[str] = set()
             for sample in samples(str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")):
-                again, _ = sample.text in done, done.add(sample.text)
+                again = sample.text in done
+                done.add(sample.text)
                 if not again and (why := _followed(sample, names, experiments)) is not None:
                     print(f"{sample}{': ' if why else ''}{why}", flush=True)
                     found += [f"{sample}: {why}"] if why else []

@@ -188,8 +188,8 @@ def _search(x, features, groups: _Groups, surface, squared, many, exact):
     name, proven = _candidates(x, features, *groups, surface, squared)
     if not exact:
         return name, proven
-    one = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, components(features)))
-    return _repair(*one, squared, many).reshape(-1, *poses), proven
+    x, name, flat, features = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, components(features)))
+    return _repair(x, name, flat, features, squared, many).reshape(-1, *poses), proven
 
 
 def nearest_vertex(

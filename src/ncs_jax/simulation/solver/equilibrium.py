@@ -21,7 +21,7 @@ UNSOLVED = 1e-3  # of a cotangent, that a solve leaves
 def equilibrium(
     settings: Settings, problem: Problem, start: Float[Array, "verts 3"]
 ) -> tuple[Float[Array, "verts 3"], Solution]:
-    """`minimise`, whose derivative is that of the minimum itself and not of the way to it.
+    """Return what `minimise` finds, with the derivative of the minimum itself and not of the way to it.
 
     Where grad E(x, s) = 0, the implicit function theorem gives dx/ds = -H^-1 d(grad E)/ds with the exact Hessian H; in
     reverse one solve with H for a cotangent, by minimal residuals that the factored approximation of H preconditions: an
@@ -29,16 +29,18 @@ def equilibrium(
     where H is singular, the derivative is NaN.
     """
     leaves, tree = jax.tree.flatten(problem)
-    smooth = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves)  # topology has no derivative
-    numbers = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if is_smooth]
-    topology = [leaf for leaf, is_smooth in zip(leaves, smooth, strict=True) if not is_smooth]
-    return _implicit((settings, tree, smooth), numbers, topology, start)
+    # A Python number, as the time step, is part of the program. Topology has no derivative.
+    kinds = tuple(leaf if isinstance(leaf, float) else bool(jnp.issubdtype(leaf.dtype, jnp.inexact)) for leaf in leaves)
+    numbers = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind is True]
+    topology = [leaf for leaf, kind in zip(leaves, kinds, strict=True) if kind is False]
+    return _implicit((settings, tree, kinds), numbers, topology, start)
 
 
 def _joined(static, numbers, topology) -> Problem:
-    _, tree, smooth = static
+    _, tree, kinds = static
     numbers, topology = iter(numbers), iter(topology)
-    return jax.tree.unflatten(tree, [next(numbers if is_smooth else topology) for is_smooth in smooth])
+    every = [next(numbers) if kind is True else next(topology) if kind is False else kind for kind in kinds]
+    return jax.tree.unflatten(tree, every)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -72,10 +72,15 @@ class Problem:
     model: Model
     couplings: Couplings
     order: Elimination
-    step: StepInputs  # its `moving` is 0 where inertia is left out, and the frame is static
+    inputs: StepInputs  # with `moving` 0 where inertia is left out, and the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     neighbours: Neighbours | None = None
     only: Int[Array, "some"] | None = None  # the vertices that move, if not all
+
+    @property
+    def step(self) -> StepInputs:
+        """The inputs, their time step a number of the program: as an array its square would be rounded twice."""
+        return replace(self.inputs, dt=1 / self.model.fps)
 
     @property
     def terms(self) -> Terms:
