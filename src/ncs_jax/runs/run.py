@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError
 from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
+from ncs_jax.network.methods.method import Method
 from ncs_jax.network.rollout import animated, first_broken
 from ncs_jax.prepare.build import Assembly, build, features_from_records
 from ncs_jax.prepare.motion_import import load_motion
@@ -25,7 +28,10 @@ from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene, scene_from
 from ncs_jax.training.step import initial_state
 
-__all__ = ["Run", "assemble", "load_run", "read_animation_over"]
+__all__ = ["Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over"]
+
+
+NetworkMaker = Callable[[Scene, Model], Method]  # makes a network of one's own, sized for a model
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Run:
     assembly: Assembly
     params: dict
     steps: int = 0
+    lacking: tuple[str, ...] = ()  # names of own terms that it was trained with and that were not given again
 
     def track(self, motion: str) -> MotionFeatures:
         """Return a motion, ready to animate: a file, `ncs:NAME`, or one as the scene names it."""
@@ -110,20 +117,29 @@ class Run:
 
     def evaluate(self, motion: str | MotionFeatures, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
         """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
+        if self.lacking:
+            mend = "open it with ncs_jax.load_run(folder, terms=[...])"
+            what = "the run's own terms are needed to measure its energies"
+            raise InputError(what, field="terms", value=self.lacking, mend=mend)
         track = self.track(motion) if isinstance(motion, str) else motion
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
 
 
-def load_run(folder: str | Path) -> Run:
+def load_run(folder: str | Path, *, terms: Sequence[OwnTerm] = (), network: NetworkMaker | None = None) -> Run:
     """Load a run folder: the scene from its JSON, the parameters from its newest checkpoint.
 
+    Args:
+        terms, network: those of one's own that the run was trained with, which a folder keeps by name alone. Without the terms
+            the garment can be animated, and energies cannot be measured.
+
     Raises:
-        InputError: not a run folder, or a file of its scene is gone.
+        InputError: not a run folder, a file of its scene is gone, or terms or network are not those of the run.
     """
     folder = Path(folder)
     facts = read_run(folder)
+    check_own(facts, folder, terms if terms else None, network)
     scene = scene_from(facts["scene"], source=str(folder / "run.json"))
-    assembly = assemble(scene, prepared=read_prepared(folder))
+    assembly = assemble(scene, prepared=read_prepared(folder), terms=terms, network=network)
     if not (folder / "checkpoints").is_dir():
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     checkpoints = Checkpoints(folder)
@@ -131,21 +147,55 @@ def load_run(folder: str | Path) -> Run:
     if step is None:
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
-    return Run(assembly, checkpoints.restore(like).params, step)
+    lacking = () if terms else tuple(facts.get("terms", ()))
+    return Run(assembly, checkpoints.restore(like).params, step, lacking)
 
 
-def assemble(scene: Scene, *, prepared: Prepared | None = None, dtype=jnp.float32) -> Assembly:
+def own_names(terms: Sequence[OwnTerm], network: NetworkMaker | None) -> dict:
+    """Return what run.json says of terms and a network of one's own: their names, nothing where there are none."""
+    names = {"terms": [term.__name__ for term in terms], "network": getattr(network, "__name__", "")}
+    return {key: value for key, value in names.items() if value}
+
+
+def check_own(facts: dict, folder: Path, terms: Sequence[OwnTerm] | None, network: NetworkMaker | None) -> None:
+    """See that terms (None: not asked for) and network are those that a run was trained with, by their names.
+
+    Raises:
+        InputError: they are not.
+    """
+    given = own_names(terms or (), network)
+    for key, asked in (("terms", terms is not None), ("network", True)):
+        expected = facts.get(key)
+        if asked and given.get(key) != expected:
+            mend = f"give the {key} that it was trained with" if expected else f"leave {key} out, or begin a new run"
+            what = f"the run's own {key} expected, {expected or 'of which it has none'}"
+            raise InputError(what, file=folder, field=key, value=given.get(key, "none"), mend=mend)
+
+
+def assemble(
+    scene: Scene,
+    *,
+    prepared: Prepared | None = None,
+    terms: Sequence[OwnTerm] = (),
+    network: NetworkMaker | None = None,
+    dtype=jnp.float32,
+) -> Assembly:
     """Make a scene ready: read its files and the runs of the garments worn below, check that they fit, precompute the rest.
 
     Args:
         scene: from `load_scene`. prepared: of a run, which needs no training motion any more; else found out here.
+        terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: makes a network of one's own from scene
+            and model, see `network.methods.method.Method`; else the scene's.
         dtype: of everything; float64 needs JAX's x64 mode.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
     below = [load_run(scene.path(name)) for name in scene.garment.over]
-    return build(scene, prepared=prepared, below=[(run.assembly, run.params) for run in below], dtype=dtype)
+    assembly = build(scene, prepared=prepared, below=[(run.assembly, run.params) for run in below], dtype=dtype)
+    if terms:
+        assembly = replace(assembly, model=assembly.model.with_terms(terms))
+    return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
 
 
 def read_animation_over(file: str | Path, model: Model, track: MotionFeatures) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.terms import OwnTerm, StepInputs
 from ncs_jax.energies.total import energies
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import skin
@@ -67,16 +67,14 @@ class Trajectory:
 def _turned(model: Model, turn) -> Array:
     """Return the gradient, N, of stretch, bending and pins of a garment that is only turned: rounding and nothing else."""
     garment, rest = model.garment, model.garment.mesh.rest
-    blended = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
-    terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False)
+    transforms = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
+    terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False, own=())
 
     def energy(x):
-        return sum(
-            energies(x, garment, model.material, StepInputs(vertex_transforms=blended), terms).values(),
-            start=jnp.zeros((), x.dtype),
-        )
+        step = StepInputs(vertex_transforms=transforms)
+        return sum(energies(x, garment, model.material, step, terms).values(), start=jnp.zeros((), x.dtype))
 
-    return jax.grad(energy)(skin(blended, rest))
+    return jax.grad(energy)(skin(transforms, rest))
 
 
 def rounding(model: Model) -> float:
@@ -104,13 +102,15 @@ def simulate(
     *,
     partial: str | Path | None = None,
     report: Callable[[Progress], None] | None = None,
+    terms: Sequence[OwnTerm] = (),
 ) -> Trajectory:
     """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
 
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
             first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
-            after every frame. The vertices are of the precision that was computed in.
+            after every frame. terms: of one's own, see `energies.terms.OwnTerm`. The vertices are of the precision that was
+            computed in.
 
     Raises:
         InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
@@ -128,11 +128,11 @@ def simulate(
     )
     precision = scene.simulation.precision
     if precision != "double":
-        assembly = assemble(lone)
+        assembly = assemble(lone, terms=terms)
         if precision == "single" or rounding(assembly.model) <= scene.simulation.tolerance:
             return _simulated(scene, lone, assembly, name, partial, report)
     with jax.enable_x64(True):
-        return _simulated(scene, lone, assemble(lone, dtype=jnp.float64), name, partial, report)
+        return _simulated(scene, lone, assemble(lone, terms=terms, dtype=jnp.float64), name, partial, report)
 
 
 def _simulated(
@@ -149,7 +149,8 @@ def _simulated(
     simulator = simulator_from(model)
     state = stepper(simulator, settings).init()
     frames = 1 + (len(matrices) - 1) // spec.substeps
-    identity = json.dumps([scene.to_dict(), name, frames], sort_keys=True)
+    own = [term.__name__ for term in model.terms.own]
+    identity = json.dumps([scene.to_dict(), name, frames, *([own] if own else [])], sort_keys=True)
     done: dict[str, np.ndarray] = {
         "vertices": np.zeros((0, *model.garment.mesh.rest.shape), dtype),
         "iterations": np.zeros(0, np.int64),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
@@ -13,12 +13,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError
 from ncs_jax.metrics.quality import summarise
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene
-from ncs_jax.runs.run import Run, assemble
+from ncs_jax.runs.run import NetworkMaker, Run, assemble, check_own, own_names
 from ncs_jax.scene.spec import Scene, load_scene, scene_from
 from ncs_jax.training.batches import CHUNK, chunks
 from ncs_jax.training.devices import give_back
@@ -40,6 +41,8 @@ def train(
     seed: int | None = None,
     resume: bool = False,
     report: Callable[[Report], None] | None = None,
+    terms: Sequence[OwnTerm] = (),
+    network: NetworkMaker | None = None,
 ) -> Run:
     """Train a garment from the physics energy alone, on every device that JAX sees.
 
@@ -47,6 +50,8 @@ def train(
         scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
         steps: optimiser steps, else the scene's. minutes: instead, as many steps as fit. seed: else the scene's.
         resume: continue the run in `out`; its steps and seed stand. report: called after every chunk of steps.
+        terms: of one's own, see `energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step inputs, in
+            J. network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
 
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 
@@ -58,9 +63,10 @@ def train(
     facts = _facts(out, resume)
     if facts is not None:
         scene, seed = scene_from(facts["scene"], source=str(out / "run.json")), facts["seed"]
+        check_own(facts, out, terms, network)
     if out is not None:
         check_writable(out)
-    assembly = assemble(scene)
+    assembly = assemble(scene, terms=terms, network=network)
     give_back()
     placed = PlacedScene(assembly, scene.training.seed if seed is None else seed)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
@@ -70,7 +76,7 @@ def train(
     if facts is None:  # before anything is written: whether it fits into memory
         placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps))
     planned = 0 if facts is None else facts["steps"]
-    with closing(_Output(placed, out, report, planned)) as output:
+    with closing(_Output(placed, out, report, {"steps": planned, **own_names(terms, network)})) as output:
         if planned:
             steps = planned
         else:
@@ -95,13 +101,13 @@ def _facts(out: Path | None, resume: bool) -> dict | None:
 class _Output:
     """What a run writes into its folder, if it has one, and what it reports."""
 
-    def __init__(self, placed: PlacedScene, out: Path | None, report: Callable[[Report], None] | None, planned: int):
-        """Open the folder. `planned`: the steps that it already knows of; where there are none, it is a new one."""
-        self._placed, self._out, self._report = placed, out, report
+    def __init__(self, placed: PlacedScene, out: Path | None, report: Callable[[Report], None] | None, facts: dict):
+        """Open the folder. `facts` of run.json: the steps planned, 0 in a new one; names of what is one's own."""
+        self._placed, self._out, self._report, self._facts = placed, out, report, facts
         self._checkpoints: Checkpoints | None = None
         self._log: RunLog | None = None
         if out is not None:
-            if not planned:
+            if not facts["steps"]:
                 self.plan(0)
                 write_prepared(out, placed.assembly.prepared)
             self._checkpoints = Checkpoints(out)
@@ -110,7 +116,8 @@ class _Output:
         """Write into run.json how many steps the run has."""
         if self._out is not None:
             scene = self._placed.assembly.scene.to_dict()
-            write_run(self._out, {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()})
+            facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
+            write_run(self._out, facts)
 
     def seconds_of_a_first_checkpoint(self, state: TrainState) -> float:
         """Write the state before the first step, unless there is one, and return how long that took."""

@@ -219,6 +219,8 @@ def no_coupling(model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array
 
 
 def for_inference(network: Any, params: dict, model: Model) -> tuple[Any, dict]:
-    """The same network with the decoder's two linear maps made one."""
+    """Return the same network with the decoder's two linear maps made one; a decoder of one's own stays as it is."""
+    if not isinstance(network.decoder, Decoder):
+        return network, params
     decoder, decoder_params = merge(network.decoder, params["decoder"], model.basis)
     return replace(network, decoder=decoder), {**params, "decoder": decoder_params}
