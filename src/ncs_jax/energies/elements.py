@@ -61,16 +61,16 @@ def energies_and_gradient(
     if alone.collision is None and not (alone.friction or alone.pinning or alone.self_contact or alone.own):
         return parts, gradient, None
 
-    def each(one):
-        x, step = one
-        return _one_pose(x, garment, material, step, alone, surface)
-
     step = replace(step, force=None)
     if not alone.own:  # which may read all of it
         step = _needed(step, alone)
-    dt = step.dt  # the same in all poses
-    one = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, replace(step, dt=jnp.zeros(x.shape[-1:], x.dtype))))
-    some, slope, to_transforms = lax.map(lambda one: each((one[0], replace(one[1], dt=dt))), one)
+    given = {name: value for name, value in vars(step).items() if value is not None and name != "dt"}
+
+    def each(one):
+        x, given = one
+        return _one_pose(x, garment, material, StepInputs(step.dt, **given), alone, surface)
+
+    some, slope, to_transforms = lax.map(each, jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, given)))
     to_transforms = None if to_transforms is None else jnp.moveaxis(to_transforms, 0, -1)
     return parts | some, gradient + jnp.moveaxis(slope, 0, -1), to_transforms
 

@@ -65,9 +65,9 @@ def _fold(step, start, items, many):
     return lax.scan(turn, start, jax.tree.map(lambda a: a[turns], items))[0]
 
 
-def components(features):
-    """Of points (count, 3, *poses) or triangles (count, 3 corners, 3, *poses), each number by itself, (count, *poses)."""
-    return [components(features[:, i]) for i in range(3)] if features.shape[1:2] == (3,) else features
+def components(features, levels: int):
+    """Return each number of points (count, 3, *poses), one level, or triangles (count, 3, 3, *poses), two, by itself."""
+    return features if levels == 0 else [components(features[:, i], levels - 1) for i in range(3)]
 
 
 def _all(x, features, squared, many):
@@ -143,7 +143,7 @@ def _candidates(x, features, blocks, lists, surface, squared):
     def step(best, at):
         near, named = grouped[at], names[at]  # (cloth groups, size, ..., 3, *poses)
         for i in range(blocks.shape[1]):
-            item = jax.tree.map(lambda a: a[:, None], components(near[:, i]))
+            item = jax.tree.map(lambda a: a[:, None], components(near[:, i], features.ndim - x[0].ndim))
             best = _closer(cloth, item, named[:, i], best, squared)
         return best, None
 
@@ -184,11 +184,12 @@ class _Groups(NamedTuple):
 
 def _search(x, features, groups: _Groups, surface, squared, many, exact):
     poses = x.shape[2:]
-    x, features = components(lax.stop_gradient(x)), lax.stop_gradient(features)
+    levels = features.ndim - 1 - len(poses)
+    x, features = components(lax.stop_gradient(x), 1), lax.stop_gradient(features)
     name, proven = _candidates(x, features, *groups, surface, squared)
     if not exact:
         return name, proven
-    x, name, flat, features = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, components(features)))
+    x, name, flat, features = jax.tree.map(lambda a: a.reshape(len(a), -1), (x, name, proven, components(features, levels)))
     return _repair(x, name, flat, features, squared, many).reshape(-1, *poses), proven
 
 
