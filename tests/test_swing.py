@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ncs_jax import InputError, assemble, load_run, runs, train
+from ncs_jax import InputError, assemble, load_run, train
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import total
 from ncs_jax.geometry.skinning import blend, skin
@@ -207,7 +207,7 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
 
     with monkeypatch.context() as patch:
-        patch.setattr(runs, "IDLE", np.inf)
+        patch.setattr("ncs_jax.runs.train.IDLE", np.inf)
         made = train(scene, tmp_path / "run", steps=40, report=reports.append)
     moved = np.mean([r.moved for r in reports])
     assert reports[-1].message == f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {moved:.2g} mm"
