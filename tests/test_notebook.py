@@ -66,3 +66,20 @@ def test_inference(tmp_path):
     difference = next(line for text in printed for line in text.splitlines() if "largest difference" in line)
     assert float(difference.split()[-2]) < 1e-5
     assert any("tshirt.onnx.json" in text for text in printed)
+
+
+def test_own_terms(tmp_path):
+    notebook, printed = ran("own_terms", tmp_path, "steps = 20")
+    every = "".join(printed)
+    assert "'wind'" in every and "'attachment'" in every and drawn(notebook) == 1
+    pushed = float(every.split("the wind's force: [")[1].split()[0])
+    assert pushed == pytest.approx(float(every.split("pressure times area: ")[1].split()[0]), rel=1e-3)
+    assert float(every.split("moves the simulated skirt by ")[1].split()[0]) > 5
+
+
+def test_own_network(tmp_path):
+    _, printed = ran("own_network", tmp_path, "steps = 20")
+    every = "".join(printed)
+    counts = [int(line.split()[-7]) for line in every.splitlines() if "parameters" in line]
+    assert len(counts) == 2 and counts[1] < counts[0] / 2
+    assert float(every.split("largest difference ")[1].split()[0]) < 1e-5

@@ -1,0 +1,137 @@
+"""Terms and a network of one's own: trained, simulated, measured, resumed, and refused where they are not those of the run."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ncs_jax
+from ncs_jax import InputError
+from ncs_jax.network.methods.choose import network_from
+from ncs_jax.training.step import chunk_runner, initial_state
+
+from .scenes import SCENE, write_scene
+
+PUSH = 0.4  # N
+
+
+def push(x, step):
+    return -PUSH * jnp.mean(x[:, 0])
+
+
+def hook(x, step):
+    return 2.0 * jnp.sum((x[0] - step.body[0]) ** 2)
+
+
+class Plain(nn.Module):
+    """A decoder of one layer."""
+
+    verts: int
+
+    @nn.compact
+    def __call__(self, code, basis):
+        offsets = nn.Dense(3 * self.verts, kernel_init=nn.initializers.normal(1e-4))(code)
+        return jnp.moveaxis(offsets.reshape(*code.shape[:-1], self.verts, 3), (-2, -1), (0, 1))
+
+
+def plain(scene, model):
+    return replace(network_from(scene, model), decoder=Plain(len(model.garment.mesh.rest)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    write_scene(folder)
+    return folder
+
+
+def scene(folder, **tables):
+    return ncs_jax.scene_from(tomllib.loads(SCENE) | tables, source=str(folder / "scene.toml"))
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        return ncs_jax.train(scene(folder), folder / "run", steps=20, terms=[push, hook])
+
+
+def test_terms_are_logged_and_measured_by_their_names(folder, trained, plain_jax):
+    with (folder / "run" / "log.csv").open() as file:
+        assert {"push", "hook"} <= set(file.readline().split(","))
+    motion = str(folder / "swing.npz")
+    x, found = trained.animate(motion), trained.evaluate(motion)
+    np.testing.assert_allclose(found["push"], -PUSH * x[:, :, 0].mean(axis=1), rtol=1e-4, atol=1e-6)
+    parts = [found[name] for name in ("membrane", "bending", "collision", "gravity", "inertia", "push", "hook")]
+    np.testing.assert_allclose(found["total"], sum(parts), rtol=1e-5)
+
+
+def test_a_run_asks_for_its_terms(folder, trained, plain_jax):
+    motion = str(folder / "swing.npz")
+    np.testing.assert_array_equal(ncs_jax.load_run(folder / "run").animate(motion), trained.animate(motion))
+    with pytest.raises(InputError, match="own terms are needed"):
+        ncs_jax.load_run(folder / "run").evaluate(motion)
+    with pytest.raises(InputError, match=r"push.*hook"):
+        ncs_jax.load_run(folder / "run", terms=[push])
+    with pytest.raises(InputError, match=r"push.*hook"):
+        ncs_jax.train(scene(folder), folder / "run", resume=True)
+    again = ncs_jax.load_run(folder / "run", terms=[push, hook]).evaluate(motion)
+    np.testing.assert_array_equal(again["push"], trained.evaluate(motion)["push"])
+    assert ncs_jax.train(scene(folder), folder / "run", resume=True, terms=[push, hook]).steps == 20
+
+
+def test_names_that_are_taken_are_refused(folder):
+    def membrane(x, step):
+        return jnp.sum(x)
+
+    for terms in ([push, push], [membrane], [lambda x, step: jnp.sum(x)]):
+        with pytest.raises(InputError, match="terms"):
+            ncs_jax.train(scene(folder), None, steps=10, terms=terms)
+
+
+def test_a_term_that_breaks_is_named(folder, plain_jax):
+    def broken(x, step):
+        return jnp.sum(jnp.sqrt(x[4] - x[4]))
+
+    reports = []
+    ncs_jax.train(scene(folder), None, steps=10, terms=[broken], report=reports.append)
+    assert reports[-1].dropped == 10 and "broken is not finite at vertex 4" in reports[-1].message
+
+
+def test_the_simulation_is_in_balance_with_a_term(folder, plain_jax):
+    tables = {"garment": {"file": "cloth.npz", "pins": "pins"}, "motion": {"files": [], "fps": 30}}
+    x = [ncs_jax.simulate(scene(folder, **tables), terms=terms) for terms in ((), (hook, push))]
+    assert all(found.residual.max() < 0.1 for found in x)
+    assert np.mean(x[1].vertices[..., 0] - x[0].vertices[..., 0]) > 0.002
+
+
+def test_without_them_the_program_is_the_same(folder):
+    text = []
+    for terms, network in (((), None), ((push,), None), ((), network_from)):
+        a = ncs_jax.assemble(scene(folder), terms=terms, network=network)
+        state, spec = initial_state(a.model, a.network, 0), a.scene.training
+        ends = jnp.zeros((1, spec.batch), jnp.int32)
+        text.append(chunk_runner(a.network, spec).lower(state, ends, ends, 10, a.model, a.track).as_text())
+    assert text[0] == text[2] and text[0] != text[1]
+
+
+def test_a_network_of_ones_own(folder, tmp_path, plain_jax):
+    run = ncs_jax.train(scene(folder), tmp_path / "run", steps=20, network=plain)
+    motion = str(folder / "swing.npz")
+    with pytest.raises(InputError, match="plain"):
+        ncs_jax.load_run(tmp_path / "run")
+    again = ncs_jax.load_run(tmp_path / "run", network=plain)
+    np.testing.assert_array_equal(again.animate(motion), run.animate(motion))
+    init, step = ncs_jax.stepper(run.assembly.model, run.assembly.network, run.params)
+    record = run.motion(motion)
+    turns = ncs_jax.local_rotations(run.assembly.model, jnp.asarray(record.poses))
+    state, streamed = init(), []
+    for turn, place in zip(turns, jnp.asarray(record.translation), strict=True):
+        state, x = step(state, turn, place)
+        streamed.append(x)
+    np.testing.assert_allclose(np.stack(streamed), run.animate(motion), atol=1e-5)
