@@ -308,7 +308,7 @@ def test_an_artifact_counts_from_the_jax_that_writes_it(tmp_path):
     """Every JAX that `constraints/` pins has its release date, so that this never depends on the day."""
     pins = [re.findall(r"^jax==(.+)$", file.read_text(), re.M) for file in (ROOT / "constraints").glob("*.txt")]
     assert pins and {version for found in pins for version in found} <= set(RELEASED)
-    assembly, params, _ = garment(tmp_path, "pbns")
+    assembly, params, _ = garment("pbns")
     made = export(assembly, params, tmp_path / "step", FileFormat("stablehlo"))
     assert made.facts | expiry(jax.__version__, date.today()) == made.facts
     assert f"usable until {made.facts['usable_until']}: a JAX released later may refuse the file" in str(made)
@@ -331,6 +331,7 @@ def test_a_host_without_jax_plays_what_the_run_animates(tmp_path):
     assembly, params, _ = garment("gated")
     run = Run(assembly, params)
     run.export(tmp_path / "step.onnx")
+    np.savez(tmp_path / "swing.npz", **swing())
     done = host(tmp_path, "step.onnx", "swing.npz", "out.npy", "1.5")
     assert done.stdout == "out.npy: 24 frames of 30 vertices\n", done.stderr
     want = run.animate(next(iter(assembly.motions)), 1.5)

@@ -119,12 +119,15 @@ class Checkpoints:
         Raises:
             InputError: the disk is full, or the folder is gone.
         """
-        ocp = _orbax()
+        # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
+        arrays = jax.tree.map(np.asarray, state)
         try:
-            with _alone(ocp):
-                # As NumPy arrays, which belong to no device: any number of devices of any kind can go on with them.
-                arrays = jax.tree.map(np.asarray, state)
-                ocp.save(self._folder / str(step), arrays, checkpointable_name=NAME)
+            if jax.process_count() > 1:
+                self._save_among_hosts(step, arrays)
+            else:
+                ocp = _orbax()
+                with _alone(ocp):
+                    ocp.save(self._folder / str(step), arrays, checkpointable_name=NAME)
             self._tidy()
         except OSError as error:
             reason = error.strerror or str(error)
@@ -132,6 +135,19 @@ class Checkpoints:
             raise InputError(
                 f"the checkpoint of step {step} cannot be written: {reason}", file=self._folder, mend=mend
             ) from None
+
+    def _save_among_hosts(self, step: int, arrays: Any) -> None:
+        """Write by Orbax's older interface: `save` of v1 (0.12) waits for every process, whichever are told to be active."""
+        import orbax.checkpoint as ocp
+
+        here = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(here, active_processes={here}, barrier_sync_key_prefix=f"process {here}")
+        options = ocp.CheckpointManagerOptions(
+            enable_async_checkpointing=False, cleanup_tmp_directories=True, create=False, multiprocessing_options=alone
+        )
+        with ocp.CheckpointManager(self._folder, options=options) as manager:
+            manager.save(step, args=ocp.args.StandardSave(arrays))
+            manager.wait_until_finished()
 
     def latest(self) -> int | None:
         """Return the step of the newest whole checkpoint, None where there is none."""
