@@ -6,6 +6,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from .conftest import AS_USERS
+
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
@@ -15,7 +17,7 @@ def ran(name, tmp_path, first=None):
     if first is not None:
         assert notebook.cells[1].source.startswith(first.split("=")[0])
         notebook.cells[1].source = first
-    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute(env=AS_USERS)
     return notebook, ["".join(o.get("text", "") for o in c.get("outputs", [])) for c in notebook.cells]
 
 
@@ -68,8 +70,9 @@ def test_inference(tmp_path):
     assert any("tshirt.onnx.json" in text for text in printed)
 
 
+@pytest.mark.slow
 def test_own_terms(tmp_path):
-    notebook, printed = ran("own_terms", tmp_path, "steps = 20")
+    notebook, printed = ran("own_terms", tmp_path, "steps, frames = 20, 6")
     every = "".join(printed)
     assert "'wind'" in every and "'attachment'" in every and drawn(notebook) == 1
     pushed = float(every.split("the wind's force: [")[1].split()[0])
@@ -77,9 +80,10 @@ def test_own_terms(tmp_path):
     assert float(every.split("moves the simulated skirt by ")[1].split()[0]) > 5
 
 
+@pytest.mark.slow
 def test_own_network(tmp_path):
-    _, printed = ran("own_network", tmp_path, "steps = 20")
+    _, printed = ran("own_network", tmp_path, "steps, frames = 20, 6")
     every = "".join(printed)
-    counts = [int(line.split()[-7]) for line in every.splitlines() if "parameters" in line]
+    counts = [int(line.split(": ")[1].split()[0]) for line in every.splitlines() if "parameters" in line]
     assert len(counts) == 2 and counts[1] < counts[0] / 2
     assert float(every.split("largest difference ")[1].split()[0]) < 1e-5
