@@ -110,7 +110,7 @@ def test_the_simulation_is_in_balance_with_a_term(folder, plain_jax):
     assert np.mean(x[1].vertices[..., 0] - x[0].vertices[..., 0]) > 0.002
 
 
-def test_without_them_the_program_is_the_same(folder):
+def test_without_them_the_program_is_the_same(folder, plain_jax):
     text = []
     for terms, network in (((), None), ((push,), None), ((), network_from)):
         a = ncs_jax.assemble(scene(folder), terms=terms, network=network)

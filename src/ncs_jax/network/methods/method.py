@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -96,8 +97,9 @@ class Method(Protocol):
     """
 
     @property
-    def decoder(self) -> Decoder:
-        """From codes to offsets."""
+    def decoder(self) -> nn.Module:
+        """From codes to offsets: a Flax module, called with codes (*poses, code) and the garment's smooth modes (verts, modes),
+        that returns offsets (verts, 3, *poses) in unposed space, m. The package's is `network.decoder.Decoder`."""
 
     @property
     def learn_weights(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder, StaticEncoder
 from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
@@ -27,7 +27,7 @@ class NCS:
 
     static: StaticEncoder
     dynamic: DynamicEncoder | None
-    decoder: Decoder
+    decoder: nn.Module
     learn_weights: bool = False
     refreshes = False
 

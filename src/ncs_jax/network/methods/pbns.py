@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import StaticEncoder
 from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
@@ -25,7 +25,7 @@ class PBNS:
     """
 
     static: StaticEncoder
-    decoder: Decoder
+    decoder: nn.Module
     learn_weights: bool = False
     state = 0
     controlled = False

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import DynamicEncoder
 from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
 from ncs_jax.scene.features import MotionFeatures
@@ -26,7 +26,7 @@ class SNUG:
     """
 
     recurrent: DynamicEncoder
-    decoder: Decoder
+    decoder: nn.Module
     learn_weights: bool = False
     controlled = False
     refreshes = False

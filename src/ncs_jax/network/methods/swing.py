@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +26,6 @@ from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
 from ncs_jax.geometry.skinning import blend
-from ncs_jax.network.decoder import Decoder
 from ncs_jax.network.encoders import StaticEncoder, SwingEncoder
 from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, decode, descriptor_sizes, garment_blend
 from ncs_jax.scene.features import MotionFeatures
@@ -48,7 +48,7 @@ class Swing:
 
     static: StaticEncoder
     dynamic: SwingEncoder
-    decoder: Decoder
+    decoder: nn.Module
     verts: int
     modes: int
     damping: float
