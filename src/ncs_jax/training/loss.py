@@ -43,8 +43,12 @@ def physics(model: Model, weights: Blend, offsets, matrices, moving, body=None):
     terms, rest = model.terms, model.garment.mesh.rest
     needs_transforms = terms.pinning or terms.friction or bool(terms.own)
 
+    def by_pose(weights):  # as one product of all poses it would round otherwise than where one is evaluated
+        each = lax.map(lambda m: blend(m, weights), jnp.moveaxis(matrices[0], -1, 0))
+        return jnp.moveaxis(each, 0, -1)
+
     def posed(last, weights):
-        return pose_garment(model, last, matrices[0], weights), blend(matrices[0], weights) if needs_transforms else None
+        return pose_garment(model, last, matrices[0], weights), by_pose(weights) if needs_transforms else None
 
     (x, transforms), back = jax.vjp(posed, offsets[0], weights)
     previous = before = None
