@@ -53,16 +53,11 @@ def pytest_collection_modifyitems(items):
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
-MAPS = 20_000  # Linux lets a process hold 65,530
-
-
 @pytest.fixture(autouse=True, scope="module")
 def programs():
-    """Let compiled programs go in good time: each holds some ten pieces of memory, and a process of too many pieces dies."""
+    """Let compiled programs go after a module: each holds some ten pieces of memory, and a process of too many pieces dies."""
     yield
-    maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > MAPS:
-        jax.clear_caches()
+    jax.clear_caches()
 
 
 @pytest.fixture
