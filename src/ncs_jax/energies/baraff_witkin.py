@@ -13,13 +13,13 @@ __all__ = ["baraff_witkin", "density"]
 
 
 def density(w: Columns, stretch, shear) -> Array:
-    """Energy per rest area, J/m^2: k_s ((|w_u| - 1)^2 + (|w_v| - 1)^2) + k_sh (w_u . w_v)^2."""
+    """Return the energy per rest area, J/m^2: k_s ((|w_u| - 1)^2 + (|w_v| - 1)^2) + k_sh (w_u . w_v)^2."""
     u, v = length(w[0]) - 1, length(w[1]) - 1
     return stretch * (u * u + v * v) + shear * dot(w[0], w[1]) ** 2
 
 
 def baraff_witkin(x: Float[Array, "verts 3 *poses"], mesh: Mesh, stretch, shear) -> Float[Array, "*poses"]:
-    """Baraff-Witkin membrane energy in J.
+    """Return the Baraff-Witkin membrane energy in J.
 
         E = sum_faces A ( k_s ((|w_u| - 1)^2 + (|w_v| - 1)^2) + k_sh (w_u . w_v)^2 )
 

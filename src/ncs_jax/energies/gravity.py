@@ -11,7 +11,7 @@ __all__ = ["gravity"]
 def gravity(
     x: Float[Array, "verts 3 *poses"], mass: Float[Array, "verts"], acceleration: Float[Array, 3]
 ) -> Float[Array, "*poses"]:
-    """Potential energy in a uniform field in J: E = - sum_v m x . g.
+    """Return the potential energy in a uniform field in J: E = - sum_v m x . g.
 
     Args:
         x: (verts, 3, *poses) in m. mass: (verts,) in kg. acceleration: (3,) g in m/s^2, any direction.

@@ -11,14 +11,14 @@ __all__ = ["inertia", "project"]
 def project(
     previous: Float[Array, "verts 3 *poses"], before: Float[Array, "verts 3 *poses"], ratio: float = 1.0
 ) -> Float[Array, "verts 3 *poses"]:
-    """Where the vertices go without forces: x_proj = x_{t-1} + (x_{t-1} - x_{t-2}) * ratio, with ratio = dt_t / dt_{t-1}."""
+    """Return where the vertices go without forces: x_proj = x_{t-1} + (x_{t-1} - x_{t-2}) * ratio; ratio = dt_t / dt_{t-1}."""
     return previous + (previous - before) * ratio
 
 
 def inertia(
     x: Float[Array, "verts 3 *poses"], target: Float[Array, "verts 3 *poses"], mass: Float[Array, "verts"], dt
 ) -> Float[Array, "*poses"]:
-    """Inertia potential in J, whose minimiser together with the other energies is a step of implicit Euler.
+    """Return the inertia potential in J, whose minimiser together with the other energies is a step of implicit Euler.
 
         E = 1 / (2 dt^2) sum_v m |x_t - x_proj|^2
 

@@ -14,13 +14,13 @@ __all__ = ["mass_spring", "per_edge"]
 
 
 def per_edge(edge: Sequence[Vector], mesh: Mesh, stiffness) -> Float[Array, "edges *poses"]:
-    """Energy of every spring, J."""
+    """Return the energy of every spring, J."""
     now = length(minus(edge[1], edge[0]))
     return stiffness / 2 * spread(mesh.edge_weight, now) * (now - spread(mesh.edge_length, now)) ** 2
 
 
 def mass_spring(x: Float[Array, "verts 3 *poses"], mesh: Mesh, stiffness) -> Float[Array, "*poses"]:
-    """Energy of the edge springs in J.
+    """Return the energy of the edge springs in J.
 
         E = 1/2 k sum_edges w (l - l0)^2,  w = (2/sqrt(3)) (A0 + A1) / l0^2
 

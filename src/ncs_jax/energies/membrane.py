@@ -15,7 +15,7 @@ Columns = Sequence[Vector]  # w_u and w_v
 
 
 def columns(face: Sequence[Vector], mesh: Mesh) -> Columns:
-    """Images w_u, w_v of the unit material axes of every face: the two columns of F = dx/du (3x2), dimensionless."""
+    """Return the images w_u, w_v of the unit material axes of every face: the two columns of F = dx/du (3x2), dimensionless."""
     e1, e2 = minus(face[1], face[0]), minus(face[2], face[0])
 
     def part(k, i, edge):
@@ -25,11 +25,11 @@ def columns(face: Sequence[Vector], mesh: Mesh) -> Columns:
 
 
 def deformation(x: Float[Array, "verts 3 *poses"], mesh: Mesh) -> Columns:
-    """The columns of every face's deformation gradient at x, in m."""
+    """Return the columns of every face's deformation gradient at x, in m."""
     return columns(corners(x, mesh.faces), mesh)
 
 
 def per_face(density: Callable[..., Array], face: Sequence[Vector], mesh: Mesh, *numbers) -> Float[Array, "faces *poses"]:
-    """Energy of every face in J: its rest area times the density. A face of zero rest area has zero axes and weighs nothing."""
+    """Return the energy of every face in J: its rest area times the density; nothing where that area is zero."""
     energy = density(columns(face, mesh), *numbers)
     return spread(mesh.face_area, energy) * energy

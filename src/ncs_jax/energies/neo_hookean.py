@@ -13,14 +13,14 @@ __all__ = ["density", "neo_hookean"]
 
 
 def density(w: Columns, lam, mu) -> Array:
-    """Energy per rest area, J/m^2: mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2, with J = |w_u x w_v|."""
+    """Return the energy per area, J/m^2: mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2, J = |w_u x w_v|."""
     stretch = dot(w[0], w[0]) + dot(w[1], w[1]) - 2
     area = length(cross(w[0], w[1])) - 1
     return mu / 2 * stretch - mu * area + (lam + mu) / 2 * area * area
 
 
 def neo_hookean(x: Float[Array, "verts 3 *poses"], mesh: Mesh, lam, mu) -> Float[Array, "*poses"]:
-    """Compression-safe membrane energy in J.
+    """Return a compression-safe membrane energy in J.
 
         E = sum_faces A [ mu/2 (|F|^2 - 2) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2 ],  J = |w_u x w_v|
 

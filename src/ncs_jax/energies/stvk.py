@@ -13,13 +13,13 @@ __all__ = ["density", "stvk"]
 
 
 def density(w: Columns, lam, mu) -> Array:
-    """Energy per rest area, J/m^2: mu |G|^2 + lambda/2 tr(G)^2 with the Green strain G = (F^T F - I)/2."""
+    """Return the energy per rest area, J/m^2: mu |G|^2 + lambda/2 tr(G)^2 with the Green strain G = (F^T F - I)/2."""
     uu, vv, uv = (dot(w[0], w[0]) - 1) / 2, (dot(w[1], w[1]) - 1) / 2, dot(w[0], w[1]) / 2
     return mu * (uu * uu + vv * vv + 2 * uv * uv) + lam / 2 * (uu + vv) ** 2
 
 
 def stvk(x: Float[Array, "verts 3 *poses"], mesh: Mesh, lam, mu) -> Float[Array, "*poses"]:
-    """St. Venant-Kirchhoff membrane energy in J.
+    """Return the St. Venant-Kirchhoff membrane energy in J.
 
         E = sum_faces A (mu |G|^2 + lambda/2 tr(G)^2)
 

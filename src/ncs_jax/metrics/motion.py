@@ -40,7 +40,7 @@ def _unposed(model: Model, vertices, matrices):
 
 
 def unposed(model: Model, vertices, track: MotionFeatures) -> Float[np.ndarray, "frames verts 3"]:
-    """The garment as seen from the body: the inverse of each vertex's blended transform applied to it, m."""
+    """Return the garment as seen from the body: the inverse of each vertex's blended transform applied to it, m."""
     return np.asarray(_unposed(model, jnp.asarray(track.relative(vertices), model.basis.dtype), track.matrices))
 
 
@@ -50,7 +50,7 @@ def _carried(model: Model, matrices) -> Float[Array, "frames verts 3"]:
 
 
 def hem(model: Model) -> np.ndarray:
-    """Numbers of the lowest rest vertices, at least one: where a garment swings most."""
+    """Return the numbers of the lowest rest vertices, at least one: where a garment swings most."""
     down = np.asarray(model.material.gravity, np.float64)
     down = down if np.linalg.norm(down) > 0 else np.array([0.0, -1.0, 0.0])
     height = -np.asarray(model.garment.mesh.rest, np.float64) @ down
@@ -58,7 +58,7 @@ def hem(model: Model) -> np.ndarray:
 
 
 def stops(track: MotionFeatures, model: Model) -> Iterator[tuple[int, int]]:
-    """(first still frame, one past the last) wherever the character has moved and then does not for `STILL` seconds."""
+    """Return (first still frame, one past the last) wherever the character has moved and then does not for `STILL` seconds."""
     fps, joints = model.fps, len(model.skeleton.parents)  # what is worn below may go on moving
     matrices, start = np.asarray(track.matrices[:, :joints], np.float64), np.asarray(track.start)
     moved = np.abs(np.diff(matrices, axis=0)).reshape(len(matrices) - 1, -1).max(axis=1, initial=0) > 1e-6
@@ -119,7 +119,7 @@ def _lag(follows: np.ndarray, leads: np.ndarray, fps: float) -> float:
 
 
 def measure_motion(model: Model, vertices, track: MotionFeatures) -> dict[str, float]:
-    """How an animation (frames, verts, 3) of the model's garment moves by itself: the first four of `MEASURES`.
+    """Measure how an animation (frames, verts, 3) of the model's garment moves by itself: the first four of `MEASURES`.
 
     `settling` and `overshoot` are left out where the character never stops for half a second, and `settling` also where the
     hem does not come to rest after any stop.
@@ -138,7 +138,7 @@ def measure_motion(model: Model, vertices, track: MotionFeatures) -> dict[str, f
 
 
 def compare_motion(model: Model, vertices, reference, track: MotionFeatures) -> dict[str, float]:
-    """An animation (frames, verts, 3) beside another of the same garment and motion: the last four of `MEASURES`."""
+    """Compare an animation (frames, verts, 3) with another of the same garment and motion: the last four of `MEASURES`."""
     u, other = unposed(model, vertices, track), unposed(model, reference, track)
     fps, low = model.fps, hem(model)
 

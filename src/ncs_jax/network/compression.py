@@ -18,7 +18,7 @@ __all__ = ["compress"]
 def compress(
     network: Method, params: dict, model: Model, track: MotionFeatures, *, rank: int = 0, bfloat16: bool = False
 ) -> tuple[Method, dict]:
-    """The same network with a smaller decoder, for `rollout.stepper` and `rollout.animate`.
+    """Return the same network with a smaller decoder, for `rollout.stepper` and `rollout.animate`.
 
         offsets = b + K h  ~  (b + K m) + V (V^T K) (h - m)
 

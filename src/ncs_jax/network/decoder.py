@@ -17,7 +17,7 @@ __all__ = ["Decoder", "merge"]
 
 @jax.custom_vjp
 def outward(kernel: Float[Array, "outside inside"], x: Float[Array, "batch inside"]) -> Float[Array, "outside batch"]:
-    """K x^T: a linear map whose many results lie first, so that poses stay beside each other in memory.
+    """Return K x^T: a linear map whose many results lie first, so that poses stay beside each other in memory.
 
     All three products of its derivative then read and write rows; on a CPU they run twice as fast as those of x W. A kernel in
     bfloat16 is multiplied in that type and summed in float32.
@@ -78,7 +78,7 @@ class Decoder(nn.Module):
             self.coefficients = Outward(3 * self.modes, nn.initializers.zeros, self.dtype)
 
     def features(self, code: Float[Array, "*poses code"]) -> Float[Array, "*poses features"]:
-        """What the linear map reads."""
+        """Return what the linear map reads."""
         h = code
         for layer in self.layers:
             h = nn.relu(layer(h))
@@ -97,7 +97,7 @@ class Decoder(nn.Module):
 
 
 def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) -> tuple[Decoder, dict]:
-    """The same decoder with one linear map, for inference."""
+    """Return the same decoder with one linear map, for inference."""
     if not decoder.modes:
         return decoder, params
 

@@ -62,7 +62,7 @@ def _states(recurrent, features, state):
 def recurrence(
     recurrent: Float[Array, "code gates"], features: Float[Array, "frames *batch gates"], state: Float[Array, "*batch code"]
 ) -> Float[Array, "frames *batch code"]:
-    """States of a gated recurrent unit, time leading: its steps in order, its weights' derivative as one product over all."""
+    """Return the states of a gated recurrent unit, time leading: its weights' derivative as one product over all."""
     return _states(recurrent, features, state)[0]
 
 
@@ -125,11 +125,11 @@ class DynamicEncoder(nn.Module):
         self.recurrent = self.param("recurrent", nn.initializers.orthogonal(), (self.state, 3 * self.state), self.dtype)
 
     def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch gates"]:
-        """What the recurrence reads, frame by frame: everything that needs no state."""
+        """Return what the recurrence reads, frame by frame: everything that needs no state."""
         return self.gates_in(self.by_frame(descriptor))
 
     def by_frame(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch size"]:
-        """The layers of each joint by itself, then those of all."""
+        """Apply the layers of each joint by itself, then those of all."""
         h = descriptor
         for layer in self.per_joint:
             h = nn.relu(layer(h))
@@ -139,7 +139,7 @@ class DynamicEncoder(nn.Module):
         return h
 
     def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch gates"]) -> Float[Array, "*batch code"]:
-        """One step of the gated recurrent unit."""
+        """Take one step of the gated recurrent unit."""
         return _cell(_parts(self.recurrent), state, features)[0]
 
     def __call__(
@@ -154,7 +154,7 @@ class DynamicEncoder(nn.Module):
     def states(
         self, features: Float[Array, "frames *batch gates"], state: Float[Array, "*batch code"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of a sequence from its features, time leading."""
+        """Return the codes of a sequence from its features, time leading."""
         return recurrence(self.recurrent, features, state)
 
 
@@ -166,19 +166,19 @@ class LinearEncoder(DynamicEncoder):
     """
 
     def cell(self, dense: Callable[[int], nn.Module]) -> None:
-        """Time constants from 1 to 20 frames, periods from 6 frames on."""
+        """Start with time constants from 1 to 20 frames, periods from 6 frames on."""
         half = self.state // 2
         self.read = dense(2 * half)
         self.nu = self.param("nu", lambda key: -jnp.log(20.0) * jax.random.uniform(key, (half,), self.dtype))
         self.angle = self.param("angle", lambda key: jax.random.uniform(key, (half,), self.dtype, 0, jnp.pi / 3))
 
     def features(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch code"]:
-        """What the recurrence adds, frame by frame: everything that needs no state."""
+        """Return what the recurrence adds, frame by frame: everything that needs no state."""
         h = self.read(self.by_frame(descriptor))
         return h * jnp.broadcast_to(jnp.tile(jnp.sqrt(-jnp.expm1(-2 * jnp.exp(self.nu))), 2), h.shape)
 
     def step(self, state: Float[Array, "*batch code"], features: Float[Array, "*batch code"]) -> Float[Array, "*batch code"]:
-        """One step of the recurrence."""
+        """Take one step of the recurrence."""
         a, b = jnp.split(state, 2, axis=-1)
         size = jnp.exp(-jnp.exp(self.nu))
         real, imaginary = (jnp.broadcast_to(size * f(self.angle), a.shape) for f in (jnp.cos, jnp.sin))
@@ -187,13 +187,13 @@ class LinearEncoder(DynamicEncoder):
     def states(
         self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of a sequence from its features, time leading."""
+        """Return the codes of a sequence from its features, time leading."""
         return self.of_motions(features, state, jnp.zeros(len(features), bool))
 
     def of_motions(
         self, features: Float[Array, "frames *batch code"], state: Float[Array, "*batch code"], begins: Bool[Array, "frames"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of motions end to end, from rest wherever one begins."""
+        """Return the codes of motions end to end, from rest wherever one begins."""
 
         def step(h, frame):
             f, begin = frame

@@ -45,7 +45,7 @@ class Rollout(NamedTuple):
 
 
 def stepper(model: Model, network: Method, params: dict) -> Rollout:
-    """A streaming animator: pure functions with explicit state, to be jitted by the caller.
+    """Return a streaming animator: pure functions with explicit state, to be jitted by the caller.
 
     `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`), the root's
     translation (3,) in m and alpha, and returns the state and the garment's vertices (verts, 3) in m. Frame for frame it gives
@@ -68,7 +68,7 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
         return StreamState(jax.device_put(code), previous, before, jax.device_put(started))
 
     def look(previous: Joints, before: Joints, started, rotations, translation):
-        """Of one character: the joints now and before, their transforms, and the descriptors."""
+        """Read one character: the joints now and before, their transforms, and the descriptors."""
         pose = forward(model.skeleton, rotations, translation)
         now = input_joints(model, rotations, pose)
         previous, before = (jax.tree.map(lambda old, new: jnp.where(started, old, new), old, now) for old in (previous, before))
@@ -112,7 +112,7 @@ def _posed(model: Model, network: Method, params: dict, weights: Blend, matrices
 def animate(
     model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float | Float[Array, ""] | None = 1.0
 ) -> Float[Array, "frames verts 3"]:
-    """Vertices of the garment over one whole motion, m: z = z_S + alpha z_D (15), decoded and skinned (16).
+    """Return the vertices of the garment over one whole motion, m: z = z_S + alpha z_D (15), decoded and skinned (16).
 
     Args:
         track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
@@ -129,14 +129,14 @@ _animate = jax.jit(animate, static_argnums=1)
 
 
 def animated(model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float = 1.0) -> np.ndarray:
-    """The same as NumPy, compiled: the last frame is repeated up to whole blocks, so that motions of many lengths share it."""
+    """Return the same as NumPy, compiled for whole blocks of frames, so that motions of many lengths share the program."""
     frames = track.start.shape[0]
     padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % PADDED)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
     return np.asarray(_animate(model, network, params, padded, float(alpha)))[:frames]
 
 
 def first_broken(model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float = 1.0) -> str:
-    """Of a motion whose vertices are not all finite: the first frame of which something is not, what, and its vertex."""
+    """Find what is not finite first in a motion: the frame, what it is, and its vertex."""
     codes = network.codes(params, model, track)
     x = animate(model, network, params, track, alpha)
     stages = {

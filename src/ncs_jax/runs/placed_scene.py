@@ -47,7 +47,7 @@ class PlacedScene:
 
     @property
     def devices(self) -> int:
-        """How many devices train."""
+        """Return how many devices train."""
         return 1 if self.mesh is None else self.mesh.size
 
     def initial_state(self) -> TrainState:

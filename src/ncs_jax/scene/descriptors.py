@@ -68,7 +68,7 @@ def _numbers_rate(now: Joints, previous: Joints, dt, kind: str) -> Float[Array, 
 
 
 def static(now: Joints, gravity: Float[Array, 3], kind: str = "heading_free") -> Float[Array, "joints numbers"]:
-    """Static descriptor of a frame: each joint's rotation and the gravity direction it sees.
+    """Return the static descriptor of a frame: each joint's rotation and the gravity direction it sees.
 
         d_S = (rotation, R^-1 g/|g|)
 
@@ -89,7 +89,7 @@ def static(now: Joints, gravity: Float[Array, 3], kind: str = "heading_free") ->
 def dynamic(
     now: Joints, previous: Joints, before: Joints, gravity: Float[Array, 3], dt, kind: str = "heading_free"
 ) -> Float[Array, "joints numbers"]:
-    """Dynamic descriptor of a frame: the rate of the static one and the unposed acceleration of each joint.
+    """Return the dynamic descriptor of a frame: the rate of the static one and the unposed acceleration of each joint.
 
         d_D = (d/dt d_S, R^-1 a),  a = (p_t - 2 p_{t-1} + p_{t-2}) / dt^2
 

@@ -36,16 +36,16 @@ class MotionFeatures:
     swing: Float[Array, "frames modes"] | None = None  # of the garment, see `methods.swing`
 
     def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
-        """Positions measured from the track's origin, in the world, m."""
+        """Return positions measured from the track's origin, in the world, m."""
         return x if self.origin is None else x + self.origin[:, None]
 
     def relative(self, x: Float[Array | np.ndarray, "frames verts 3"]) -> np.ndarray:
-        """The other way round, of any array, as NumPy."""
+        """Return the other way round, of any array, as NumPy."""
         return np.asarray(x) if self.origin is None else np.asarray(x) - np.asarray(self.origin)[: len(x), None]
 
 
 def input_joints(model: Model, local: Float[Array, "joints 3 3"], pose) -> Joints:
-    """The joints that the network reads."""
+    """Return the joints that the network reads."""
     inputs = np.asarray(model.inputs)
     return Joints(local[inputs], pose.rotations[inputs], pose.positions[inputs])
 
@@ -57,7 +57,7 @@ def motion_features(
     translation: Float[Array, "frames 3"],
     start: Int[Array, "frames"],
 ) -> MotionFeatures:
-    """Descriptors and joint transforms of motions laid end to end, sampled at the model's frame rate.
+    """Return descriptors and joint transforms of motions laid end to end, sampled at the model's frame rate.
 
     Args:
         local: local rotations of the model's joints since rest. translation: of the root, m. start: first frame of the motion
@@ -76,7 +76,7 @@ def motion_features(
 
 
 def mirror(poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The motion in a mirror across the character's middle: a new one, the given one is left as it is.
+    """Return the motion in a mirror across the character's middle: a new one, the given one is left as it is.
 
     Args:
         poses: (frames, joints, 3) axis-angle. translation: (frames, 3) m. partner: (joints,) the joint on the other side, or

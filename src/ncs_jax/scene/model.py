@@ -44,7 +44,7 @@ class Layer:
 
     @property
     def rest(self) -> Float[Array, "verts 3"]:
-        """Its place at rest, m."""
+        """Return its place at rest, m."""
         return self.model.garment.mesh.rest
 
 

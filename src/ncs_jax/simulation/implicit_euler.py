@@ -119,7 +119,7 @@ def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Ar
 
 
 def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulation:
-    """A simulation frame by frame: pure functions with explicit state, to be jitted by the caller.
+    """Return a simulation frame by frame: pure functions with explicit state, to be jitted by the caller.
 
     `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`) and the root's
     translation (3,) in m, if wanted an external force (verts, 3) in N, and returns the state, whose `solution` tells how the
@@ -176,7 +176,7 @@ def simulate(
     state: SimulationState | None = None,
     forces=None,
 ) -> tuple[Float[Array, "frames verts 3"], Solution]:
-    """Vertices over one whole motion (frames, verts, 3) in m, and how every frame's solve went.
+    """Return the vertices over one whole motion (frames, verts, 3) in m, and how every frame's solve went.
 
     Args:
         simulator: from `simulator_from`. track: of one motion, from `motion.track`. settings: tolerance and iterations.

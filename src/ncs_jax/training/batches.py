@@ -13,7 +13,7 @@ CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
 
 
 def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.ndarray:
-    """The last frames of the windows of steps first .. first + count, (count, batch): every frame once a round, shuffled.
+    """Return the last frames of the windows of steps first .. first + count, (count, batch): each once a round, shuffled.
 
     A pure function of its arguments, so that a resumed run sees what an unbroken one would have seen.
     """
@@ -25,7 +25,7 @@ def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.nd
 
 
 def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:
-    """(first step, count) of every chunk up to `steps`, cut at the multiples of CHUNK wherever a run resumes."""
+    """Yield (first step, count) of every chunk up to `steps`, cut at the multiples of CHUNK wherever a run resumes."""
     while first < steps:
         upto = min((first // CHUNK + 1) * CHUNK, steps)
         yield first, upto - first

@@ -76,7 +76,7 @@ def _through_time(model: Model, weights: Blend, offsets, matrices, moving):
 
 
 def gradients(model: Model, network: Method, params, track: MotionFeatures, windows: Windows):
-    """One step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
+    """Return one step's gradient: the network's transposed derivative applied to the physics' gradient at the vertices.
 
     Returns gradients of the parameters, the batch's energies by term (batch,), and what `Fault` needs of every sample: the
     gradient at the last frame's offsets, and the offsets of all frames.

@@ -24,7 +24,7 @@ __all__ = ["diagnose", "training_metrics"]
 def training_metrics(
     model: Model, network: Method, window: int, params, track: MotionFeatures, ends
 ) -> dict[str, Float[Array, ""]]:
-    """Mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
+    """Return mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
 
     Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
     """
@@ -53,7 +53,7 @@ def training_metrics(
 
 
 def diagnose(model: Model, network: Method, params, track: MotionFeatures, fault: Fault) -> str:
-    """Which term of a dropped step went non-finite, in which frame, and at which vertex first."""
+    """Find which term of a dropped step went non-finite, in which frame, and at which vertex first."""
     model, frame = replace(model, terms=network.loss(model.terms)), int(fault.frame)
     history = 3 if model.terms.inertia else 1
     back = jnp.maximum(frame - jnp.arange(history), track.start[frame])

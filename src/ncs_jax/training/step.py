@@ -50,14 +50,14 @@ ADAM = optax.scale_by_adam(*BETAS)
 
 
 def step_size(spec: TrainingSpec, step, steps) -> Float[Array, ""]:
-    """From the learning rate down to 2 % of it along a cosine, at the last of `steps`."""
+    """Return a rate that falls from the learning rate down to 2 % of it along a cosine, at the last of `steps`."""
     fall = jnp.clip(step / jnp.maximum(steps, 1), 0, 1)
     return spec.learning_rate * (0.02 + 0.98 * (1 + jnp.cos(jnp.pi * fall)) / 2)
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def initial_state(model: Model, network: Method, seed: int) -> TrainState:
-    """Fresh parameters and a fresh optimiser."""
+    """Return fresh parameters and a fresh optimiser."""
     params = initial_parameters(network, jax.random.PRNGKey(seed), model)
     zero = jnp.zeros((), jnp.int32)
     fault = Fault(zero, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
@@ -131,7 +131,7 @@ def step(task: Task, steps, state: TrainState, track: MotionFeatures, indices) -
 
 
 def chunk_runner(network: Method, spec: TrainingSpec, mesh: Mesh | None = None):
-    """Several steps compiled as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
+    """Compile several steps as one: f(state, ends (n, batch), pairs (n, batch), steps, model, track) -> state, logs.
 
     `steps` is how many the whole training has, for the schedule. The state's buffers are reused. The track is that of
     `with_bodies`. With a mesh of several devices (`devices.batch_mesh`), each works on its part of the batch and takes the same

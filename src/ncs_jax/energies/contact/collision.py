@@ -9,7 +9,7 @@ __all__ = ["collision"]
 
 
 def collision(distance: Float[Array, "verts *poses"], thickness, stiffness) -> Float[Array, "*poses"]:
-    """Collision energy in J.
+    """Return the collision energy in J.
 
         E = k_c sum_v min(d(x_v) - eps, 0)^2
 

@@ -14,7 +14,7 @@ __all__ = ["intersecting"]
 
 
 def intersecting(x: Float[Array, "verts 3"], mesh: Mesh, groups: Groups) -> tuple[Bool[Array, "faces"], Bool[Array, ""]]:
-    """Which triangles pass through another that shares no vertex with them, and whether the search ran out of room.
+    """Return which triangles pass through another that shares no vertex with them, and whether the search ran out of room.
 
     Two triangles pass through each other where an edge of one goes through the inside of the other; triangles in one plane, or
     that only touch, do not. An edge p q goes through a triangle a b c where p and q lie on different sides of it, and p q on

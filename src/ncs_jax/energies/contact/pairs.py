@@ -172,7 +172,7 @@ def _overlap(low, high, down, up):
 
 
 def overlapping_members(x, first, second, radius, most: int, moved=None):
-    """Which members (i, j) have boxes that overlap and no vertex in common: at most `most` of them; how many there are; and
+    """Find the members (i, j) whose boxes that overlap and no vertex in common: at most `most` of them; how many there are; and
     whether that is more than there is room for.
 
     `first` and `second`: the vertices of the members, and their groups; where both are the same, every pair once. `moved`:
@@ -228,7 +228,7 @@ def overlapping_members(x, first, second, radius, most: int, moved=None):
 
 
 def keep_candidates(keep, first, second, found, most: int):
-    """Of the candidates those that `keep` keeps, at most `most`; whether each is one; whether there are more."""
+    """Return the candidates that `keep` keeps, at most `most`; whether each is one; whether there are more."""
 
     def look(state):
         start, kept = state
@@ -244,7 +244,7 @@ def keep_candidates(keep, first, second, found, most: int):
 
 
 def candidate_room(count: int) -> int:
-    """For the candidates of so many members."""
+    """Return how many candidates of so many members there is room for."""
     return -(-max(CANDIDATES_EACH * count, 4 * LEAST) // CHUNK) * CHUNK
 
 

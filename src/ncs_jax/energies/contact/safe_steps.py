@@ -51,7 +51,7 @@ def _relative(p):
 
 
 def free_share(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs, radius) -> Float[Array, ""]:
-    """Largest share t, at most 1, of the move p (m) on whose way no pair can pass through each other.
+    """Return the largest share t, at most 1, of the move p (m) on whose way no pair can pass through each other.
 
     The listed pairs by planes between them (see `_free`); all others are `radius` apart (m, of the search that found the
     pairs), of which no two vertices use up more than 0.9.
@@ -66,7 +66,7 @@ def free_share(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pa
 
 
 def yielding(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs) -> Float[Array, "verts 3"]:
-    """The move p (m) without what would bring the listed pairs of x nearer than a fifth of their distance, as far as it goes.
+    """Return the move p (m) without what would bring the listed pairs of x nearer than a fifth of their distance.
 
     A plane across n midway between the two goes with them, at the mean of their vertices' speeds along n. What carries a vertex
     nearer to it than allowed is taken off, the mean over its pairs, until nothing is left or `PASSES` times. So one pair that

@@ -41,7 +41,7 @@ def _apart(x, pairs):
 
 
 def barrier(s: Float[Array, "*pairs"]) -> tuple[Float[Array, "*pairs"], Float[Array, "*pairs"], Float[Array, "*pairs"]]:
-    """B(s) = -(1 - s)^2 ln s for s < 1, else 0, with its first and second derivative; below `LEAST` its parabola there."""
+    """Return B(s) = -(1 - s)^2 ln s for s < 1, else 0, and its first two derivatives; below `LEAST` its parabola there."""
     t = jnp.clip(s, LEAST, 1)
     log, rest, below = jnp.log(t), 1 - t, jnp.minimum(s - LEAST, 0)
     value, slope = -(rest**2) * log, 2 * rest * log - rest**2 / t
@@ -56,7 +56,7 @@ def _pushed(distance, pairs, thickness):
 
 
 def repulsion(x: Float[Array, "verts 3"], pairs: Pairs, thickness: Float[Array, ""] | float) -> Repulsion:
-    """What every pair contributes at x (m), with thickness eps in m; see `self_contact`."""
+    """Return what every pair contributes at x (m), with thickness eps in m; see `self_contact`."""
     vertices, weights, apart = _apart(x, pairs)
     value, slope, curvature, keep = _pushed(norm(apart), pairs, thickness)
     return Repulsion(vertices, keep**2 * value, keep * slope, curvature, weights, normalize(apart))
@@ -68,7 +68,7 @@ def self_contact(
     thickness: Float[Array, ""] | float,
     stiffness: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Self-contact energy in J.
+    """Return the self-contact energy in J.
 
         E = k_s sum_pairs e^2 B(d / e),   B(s) = -(1 - s)^2 ln s for s < 1, else 0,   e = min(eps, d_rest)
 
@@ -90,7 +90,7 @@ def self_contact(
 
 
 def energy(found: Repulsion, stiffness: Float[Array, ""] | float) -> Float[Array, ""]:
-    """E in J: `self_contact` of pairs that are known."""
+    """Return E in J: `self_contact` of pairs that are known."""
     return stiffness * jnp.sum(found.value)
 
 
@@ -101,23 +101,23 @@ def _spread(found, each, like):
 
 
 def gradient(found: Repulsion, x: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3"]:
-    """dE/dx_i = sum_pairs dE/dd w_i n in N; of x only the shape counts."""
+    """Return dE/dx_i = sum_pairs dE/dd w_i n in N; of x only the shape counts."""
     along = (stiffness * found.slope)[:, None] * found.weights
     return _spread(found, along[..., None] * found.direction[:, None], x)
 
 
 def springs(found: Repulsion, stiffness: Float[Array, ""] | float) -> Float[Array, "pairs 4 3"]:
-    """v_i = sqrt(d^2E/dd^2) w_i n: the Hessian along n is sum_pairs v v^T, positive semi-definite."""
+    """Return v_i = sqrt(d^2E/dd^2) w_i n: the Hessian along n is sum_pairs v v^T, positive semi-definite."""
     return (jnp.sqrt(stiffness * found.curvature)[:, None] * found.weights)[..., None] * found.direction[:, None]
 
 
 def product(found: Repulsion, p: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3"]:
-    """Hessian along n times p (m): sum_pairs v (v . p) in N."""
+    """Return the Hessian along n times p (m): sum_pairs v (v . p) in N."""
     v = springs(found, stiffness)
     return _spread(found, v * jnp.sum(v * p[found.vertices], axis=(1, 2))[:, None, None], p)
 
 
 def blocks(found: Repulsion, x: Float[Array, "verts 3"], stiffness: Float[Array, ""] | float) -> Float[Array, "verts 3 3"]:
-    """Blocks on the diagonal of the Hessian along n: sum_pairs v_i v_i^T in N/m; of x only the shape counts."""
+    """Return blocks on the diagonal of the Hessian along n: sum_pairs v_i v_i^T in N/m; of x only the shape counts."""
     v = springs(found, stiffness)
     return _spread(found, v[..., :, None] * v[..., None, :], x)

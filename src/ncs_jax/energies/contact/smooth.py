@@ -1,4 +1,4 @@
-"""Contact with a smooth body: collision, equation (12), to a surface whose distance has no steps and no kinks."""
+"""Return the contact with a smooth body: collision, equation (12), to a surface whose distance has no steps and no kinks."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _products(v):
 
 
 def curvatures(body: Float[Array, "body 3"], normals: Float[Array, "body 3"], surface: Surface) -> Float[Array, "body 3 3"]:
-    """Shape operators of the body's vertices in 1/m: how the normal turns along the surface, dn = S dx.
+    """Return the shape operators of the body's vertices in 1/m: how the normal turns along the surface, dn = S dx.
 
     The mean over the faces around, weighted by area, of the normals' gradient, symmetric and within the tangent plane; no
     greater than the mesh can show. Source: Rusinkiewicz 2004, by linear elements.
@@ -72,7 +72,7 @@ def curvatures(body: Float[Array, "body 3"], normals: Float[Array, "body 3"], su
 
 
 def nearby_quadrics(x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface) -> Quadrics:
-    """The quadrics of the groups of body vertices that lie nearest to every group of cloth vertices."""
+    """Return the quadrics of the groups of body vertices that lie nearest to every group of cloth vertices."""
     blocks = surface.vertex_blocks
     cloth = lax.stop_gradient(x)[surface.cloth_blocks]
     _, chosen = nearest_groups(cloth, lax.stop_gradient(body)[blocks], surface.groups)
@@ -148,7 +148,7 @@ def blended_contact(
     thickness: Float[Array, ""] | float,
     only: Int[Array, "some"] | None = None,
 ) -> BlendedContact:
-    """Contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
+    """Return the contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
 
         shortfall = sum_i v_i min(d_i - thickness, 0)^2
         d_i = z_i + g_i r_i . S_i r_i / 2 + 2 h e_i^2 / (1 + q_i),   e_i = max(q_i - (z_i/2h)^2 - 1, 0)

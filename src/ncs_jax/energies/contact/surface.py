@@ -77,7 +77,7 @@ def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
 
 
 def rebuild_lists(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
-    """The same, its search for the nearest vertex prepared for what is near what in these poses [(cloth, body)]."""
+    """Return the same with its search for the nearest vertex prepared for what is near what in these poses [(cloth, body)]."""
     lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
     return replace(surface, vertex_lists=jax.device_put(lists))
 
@@ -131,13 +131,13 @@ def surface_from(
 
 
 def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> Float[Array, "faces 3"]:
-    """Unit normals; zero for a collapsed face."""
+    """Return unit normals; zero for a collapsed face."""
     a, b, c = body[faces[:, 0]], body[faces[:, 1]], body[faces[:, 2]]
     return normalize(jnp.cross(b - a, c - a))
 
 
 def vertex_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
-    """Area-weighted unit normals of the body's vertices."""
+    """Return area-weighted unit normals of the body's vertices."""
     a, b, c = corners(body, surface.faces)
     area = jnp.stack(cross(minus(b, a), minus(c, a)), axis=1)
     around = [jnp.take(area, at, axis=0, mode="fill", fill_value=0) for at in surface.rings.T]

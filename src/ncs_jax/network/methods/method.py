@@ -20,6 +20,7 @@ from ncs_jax.scene.model import Model
 
 __all__ = [
     "Codes",
+    "FromCodes",
     "Kept",
     "Method",
     "Offsets",
@@ -29,8 +30,6 @@ __all__ = [
     "for_inference",
     "garment_blend",
     "initial_parameters",
-    "no_coupling",
-    "window_offsets",
 ]
 
 
@@ -42,11 +41,11 @@ class Codes(NamedTuple):
     swing: Array | None = None
 
     def together(self, alpha: float | Array | None = 1.0) -> Array:
-        """z_S + alpha z_D (15); None leaves z_D out."""
+        """Return z_S + alpha z_D (15); None leaves z_D out."""
         return self.static if self.dynamic is None or alpha is None else self.static + alpha * self.dynamic
 
     def swung(self, alpha: float | Array | None = 1.0) -> Array | None:
-        """alpha q; None leaves it out."""
+        """Return alpha q; None leaves it out."""
         return None if self.swing is None or alpha is None else alpha * self.swing
 
 
@@ -122,18 +121,18 @@ class Method(Protocol):
         """Whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
-        """Fresh parameters of all but the decoder."""
+        """Return fresh parameters of all but the decoder."""
 
     def step(
         self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array
     ) -> tuple[Array, Codes]:
-        """One frame of any number of characters, its descriptors and joint transforms: the new state, and the codes."""
+        """Return the state after a frame and its codes, from descriptors and joint transforms; of any number of characters."""
 
     def loss(self, terms: Terms) -> Terms:
-        """Of a scene's terms those that train it, and whether inertia's target carries a gradient."""
+        """Return those of a scene's terms that train it, and whether inertia's target carries a gradient."""
 
     def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
-        """Return what one step of training differentiates, and what it keeps constant; see `window_offsets`."""
+        """Return what one step of training differentiates, and what it keeps constant; see `FromCodes`."""
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return energies (batch,) in J beyond the scene's terms, by name, and their gradient by the extra array, N."""
@@ -142,20 +141,20 @@ class Method(Protocol):
         """Return the motions with what the network, as it is now, tells them. Training calls this now and then."""
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
-        """Of every frame (frames, code) of one motion, from rest at its start."""
+        """Return the codes of every frame (frames, code) of one motion, from rest at its start."""
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Of the `last` frames (last, batch, code) of windows of `length` frames, from rest, that end at `ends`."""
+        """Return the codes (last, batch, code) of the `last` frames of windows of `length` frames that end at `ends`."""
 
 
 def descriptor_sizes(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Shapes (joints, numbers) of a frame's static and dynamic descriptors."""
+    """Return the shapes (joints, numbers) of a frame's static and dynamic descriptors."""
     joints, numbers = len(model.inputs), DESCRIPTORS[model.descriptor]
     return (joints, numbers + 3), (joints, numbers + 6)
 
 
 def initial_parameters(network: Method, key: Array, model: Model) -> dict:
-    """Fresh parameters: a plain pytree of arrays."""
+    """Return fresh parameters: a plain pytree of arrays."""
     first, second, third = jax.random.split(key, 3)
     code = jnp.zeros(network.code, model.basis.dtype)
     params = network.init((first, second), model)
@@ -166,7 +165,7 @@ def initial_parameters(network: Method, key: Array, model: Model) -> dict:
 
 
 def garment_blend(network: Method, params: dict, model: Model) -> Blend:
-    """The garment's skinning weights: given, or scaled by learned factors w exp(s) / sum, which keep zeros zero."""
+    """Return the garment's skinning weights: given, or scaled by learned factors w exp(s) / sum, which keep zeros zero."""
     if not network.learn_weights:
         return model.blend
     scaled = model.blend.weights * jnp.exp(params["blend"])
@@ -180,44 +179,50 @@ def decode(
     code: Float[Array, "*frames code"],
     swing: Float[Array, "*frames modes"] | None = None,
 ) -> Float[Array, "verts 3 *frames"]:
-    """Offsets in unposed space, m: those of the code, and those of a swing along the model's vibrations."""
+    """Return offsets in unposed space, m: those of the code, and those of a swing along the model's vibrations."""
     offsets = jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
     if swing is None:
         return offsets
     return offsets + jnp.tensordot(model.vibrations.directions, swing, (-1, -1))
 
 
-def window_offsets(
-    network: Method, params: dict, model: Model, track: MotionFeatures, windows: Windows
-) -> tuple[Offsets, Kept]:
-    """Return the offsets of windows whose codes come from `network.windows`: those that the loss differentiates.
+class FromCodes:
+    """What methods share that train on nothing but the codes of their windows: nothing couples, and nothing is refreshed."""
 
-    With motion augmentation the first windows take another one's dynamic code on their static code, both constants.
-    """
-    history = windows.history
-    z_static, z_dynamic, _ = network.windows(params, track, windows.ends, max(windows.length, history), history)
-    augmented = windows.augmented
-    if z_dynamic is None:
-        z = z_static
-    elif not augmented:
-        z = z_static + z_dynamic
-    elif windows.axis is not None:  # any number of this device's windows are such, and the others' codes may be elsewhere
-        everyone = lax.all_gather(lax.stop_gradient(z_dynamic), windows.axis, axis=1, tiled=True)
-        mixed = lax.stop_gradient(z_static) + everyone[:, windows.others]
-        z = jnp.where(windows.own[:, None], z_static + z_dynamic, mixed)
-    else:
-        others = windows.others[:augmented]
-        mixed = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, others])
-        z = jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
-    if not model.terms.through_time:
-        return Offsets([decode(network, params, model, z[-1])]), Kept(z)
-    every = decode(network, params, model, z)
-    return Offsets([every[:, :, k] for k in (2, 1, 0)]), Kept(z)
+    refreshes = False
 
+    def offsets(self: Method, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
+        """Return the offsets of windows whose codes come from `self.windows`: those that the loss differentiates.
 
-def no_coupling(model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
-    """Return no energy: for methods whose offsets have no extra array."""
-    return {}, jnp.zeros_like(extra)
+        With motion augmentation the first windows take another one's dynamic code on their static code, both constants.
+        """
+        history = windows.history
+        z_static, z_dynamic, _ = self.windows(params, track, windows.ends, max(windows.length, history), history)
+        augmented = windows.augmented
+        if z_dynamic is None:
+            z = z_static
+        elif not augmented:
+            z = z_static + z_dynamic
+        elif windows.axis is not None:  # any number of this device's windows are such, and the others' codes may be elsewhere
+            everyone = lax.all_gather(lax.stop_gradient(z_dynamic), windows.axis, axis=1, tiled=True)
+            mixed = lax.stop_gradient(z_static) + everyone[:, windows.others]
+            z = jnp.where(windows.own[:, None], z_static + z_dynamic, mixed)
+        else:
+            others = windows.others[:augmented]
+            mixed = lax.stop_gradient(z_static[:, :augmented]) + lax.stop_gradient(z_dynamic[:, others])
+            z = jnp.concatenate([mixed, (z_static + z_dynamic)[:, augmented:]], axis=1)
+        if not model.terms.through_time:
+            return Offsets([decode(self, params, model, z[-1])]), Kept(z)
+        every = decode(self, params, model, z)
+        return Offsets([every[:, :, k] for k in (2, 1, 0)]), Kept(z)
+
+    def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
+        """Return no energy: the offsets have no extra array."""
+        return {}, jnp.zeros_like(extra)
+
+    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
+        """Return the motions as they are."""
+        return features
 
 
 def for_inference(network: Any, params: dict, model: Model) -> tuple[Any, dict]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder, StaticEncoder
-from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
+from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -19,8 +19,8 @@ __all__ = ["NCS"]
 
 
 @dataclass(frozen=True)
-class NCS:
-    """The three networks; `dynamic` is None for a character that never moves. See `methods.shared.Method`.
+class NCS(FromCodes):
+    """The three networks; `dynamic` is None for a character that never moves. See `methods.method.Method`.
 
     Source: Bertiche, Madadi, Escalera 2022.
     """
@@ -29,7 +29,6 @@ class NCS:
     dynamic: DynamicEncoder | None
     decoder: nn.Module
     learn_weights: bool = False
-    refreshes = False
 
     @property
     def code(self) -> int:
@@ -47,7 +46,7 @@ class NCS:
         return self.dynamic is not None
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
-        """Fresh parameters of both encoders."""
+        """Return fresh parameters of both encoders."""
         static, dynamic = (jnp.zeros(size, model.basis.dtype) for size in descriptor_sizes(model))
         params = {"static": self.static.init(keys[0], static)["params"]}
         if self.dynamic is not None:
@@ -55,11 +54,11 @@ class NCS:
         return params
 
     def loss(self, terms: Terms) -> Terms:
-        """All of them, inertia's target a constant: a minimum is a step of implicit Euler."""
+        """Return all of them, inertia's target a constant: a minimum is a step of implicit Euler."""
         return terms
 
     def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
-        """z_S of the frame, and z_D, which is the new state."""
+        """Return z_S of the frame, and z_D, which is the new state."""
         fixed = self._static(params, static)
         if self.dynamic is None:
             return state, Codes(fixed)
@@ -68,18 +67,8 @@ class NCS:
         state = jnp.asarray(self.dynamic.apply(variables, state, features, method="step"))
         return state, Codes(fixed, state)
 
-    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
-        """Return the offsets of windows from their codes."""
-        return window_offsets(self, params, model, track, windows)
-
-    coupling = staticmethod(no_coupling)
-
-    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
-        """Return the motions as they are."""
-        return features
-
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
-        """z_S of every frame by itself, and z_D from rest at the motion's start."""
+        """Return z_S of every frame by itself, and z_D from rest at the motion's start."""
         fixed = self._static(params, track.static)
         if self.dynamic is None:
             return Codes(fixed)
@@ -87,7 +76,7 @@ class NCS:
         return Codes(fixed, jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, track.dynamic, rest)))
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Time leading. Frames before a motion's start are rest: zero dynamic descriptors.
+        """Return codes, time leading. Frames before a motion's start are rest: zero dynamic descriptors.
 
         Of few motions (fewer frames than all windows together) a linear cell knows the whole motion before.
         """

@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.encoders import StaticEncoder
-from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
+from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -18,8 +18,8 @@ __all__ = ["PBNS"]
 
 
 @dataclass(frozen=True)
-class PBNS:
-    """An encoder of the pose and the decoder. See `methods.shared.Method`.
+class PBNS(FromCodes):
+    """An encoder of the pose and the decoder. See `methods.method.Method`.
 
     Source: Bertiche, Madadi, Escalera 2021, with the descriptors, sizes and decoder of the other methods here.
     """
@@ -29,7 +29,6 @@ class PBNS:
     learn_weights: bool = False
     state = 0
     controlled = False
-    refreshes = False
 
     @property
     def code(self) -> int:
@@ -37,33 +36,23 @@ class PBNS:
         return self.static.sizes[-1]
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
-        """Fresh parameters of the encoder."""
+        """Return fresh parameters of the encoder."""
         return {"static": self.static.init(keys[0], jnp.zeros(descriptor_sizes(model)[0], model.basis.dtype))["params"]}
 
     def loss(self, terms: Terms) -> Terms:
-        """All but inertia, and friction, which knows of a frame before."""
+        """Return all but inertia, and friction, which knows of a frame before."""
         return replace(terms, inertia=False, friction=False)
 
     def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
-        """The code of the frame's pose; nothing is carried."""
+        """Return the code of the frame's pose; nothing is carried."""
         return state, self._of(params, static)
 
-    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
-        """Return the offsets of windows from their codes."""
-        return window_offsets(self, params, model, track, windows)
-
-    coupling = staticmethod(no_coupling)
-
-    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
-        """Return the motions as they are."""
-        return features
-
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
-        """Of every frame by itself."""
+        """Return the code of every frame by itself."""
         return self._of(params, track.static)
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Of the last frames, time leading; a window begins at its motion's start at the earliest."""
+        """Return the codes of the last frames, time leading; a window begins at its motion's start at the earliest."""
         back = ends[None] - jnp.arange(last - 1, -1, -1, dtype=ends.dtype)[:, None]
         return self._of(params, track.static[jnp.maximum(back, track.start[ends][None])])
 

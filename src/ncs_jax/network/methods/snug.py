@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
 from ncs_jax.network.encoders import DynamicEncoder
-from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, descriptor_sizes, no_coupling, window_offsets
+from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -18,8 +18,8 @@ __all__ = ["SNUG"]
 
 
 @dataclass(frozen=True)
-class SNUG:
-    """A recurrent encoder, with bias, of the pose and of the root's motion; and the decoder. See `methods.shared.Method`.
+class SNUG(FromCodes):
+    """A recurrent encoder, with bias, of the pose and of the root's motion; and the decoder. See `methods.method.Method`.
 
     Nothing tells what the pose gives from what motion adds: alpha scales nothing.
     Source: Santesteban, Otaduy, Casas 2022, with the descriptors, sizes and decoder of the other methods here.
@@ -29,7 +29,6 @@ class SNUG:
     decoder: nn.Module
     learn_weights: bool = False
     controlled = False
-    refreshes = False
 
     @property
     def code(self) -> int:
@@ -42,40 +41,33 @@ class SNUG:
         return self.recurrent.state
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
-        """Fresh parameters of the encoder."""
+        """Return fresh parameters of the encoder."""
         static, dynamic = (jnp.zeros((1, *size), model.basis.dtype) for size in descriptor_sizes(model))
         state = jnp.zeros(self.state, model.basis.dtype)
         return {"recurrent": self.recurrent.init(keys[0], self._read(static, dynamic), state)["params"]}
 
     def loss(self, terms: Terms) -> Terms:
-        """All of them, inertia's target differentiated too."""
+        """Return all of them, inertia's target differentiated too."""
         return replace(terms, through_time=terms.inertia)
 
     def step(self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array):
-        """The code of the frame, which is the new state."""
+        """Return the code of the frame, which is the new state."""
         variables = {"params": params["recurrent"]}
         features = self.recurrent.apply(variables, self._read(static, dynamic), method="features")
         state = jnp.asarray(self.recurrent.apply(variables, state, features, method="step"))
         return state, Codes(state)
 
-    def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
-        """Return the offsets of windows from their codes."""
-        return window_offsets(self, params, model, track, windows)
-
-    coupling = staticmethod(no_coupling)
-
-    def refresh(self, params: dict, model: Model, features: MotionFeatures) -> MotionFeatures:
-        """Return the motions as they are."""
-        return features
-
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
-        """From a state of zero at the motion's start."""
+        """Return the codes from a state of zero at the motion's start."""
         rest = jnp.zeros(self.state, track.static.dtype)
         inputs = self._read(track.static, track.dynamic)
         return Codes(jnp.asarray(self.recurrent.apply({"params": params["recurrent"]}, inputs, rest)))
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Time leading, from a state of zero at a window's start; frames before a motion's start are its first, at rest."""
+        """Return codes, time leading, from a state of zero at a window's start.
+
+        Frames before a motion's start are its first, at rest.
+        """
         start = track.start[ends]
         back = ends[None] - jnp.arange(length - 1, -1, -1, dtype=ends.dtype)[:, None]
         inside = jnp.maximum(back, start[None])

@@ -40,7 +40,7 @@ QUIET = 0.02  # of a track's largest swing: a smaller one is not enlarged that f
 
 @dataclass(frozen=True)
 class Swing:
-    """The three networks, the dynamic one of the swing. See `methods.shared.Method`.
+    """The three networks, the dynamic one of the swing. See `methods.method.Method`.
 
     verts, modes: how many vertices and vibrations the garment has. damping: c, 1/s. Source: none; the slides' codes that add,
     with modal dynamics (Pentland and Williams 1989) in place of a recurrent network.
@@ -67,7 +67,7 @@ class Swing:
         return 6 * self.verts + 3 + self.modes + 1
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
-        """Fresh parameters of both encoders."""
+        """Return fresh parameters of both encoders."""
         static, swing = jnp.zeros(descriptor_sizes(model)[0], model.basis.dtype), jnp.zeros(self.modes, model.basis.dtype)
         return {
             "static": self.static.init(keys[0], static)["params"],
@@ -75,13 +75,13 @@ class Swing:
         }
 
     def loss(self, terms: Terms) -> Terms:
-        """All but inertia, which is the swing's, and friction, which knows of a frame before."""
+        """Return all but inertia, which is the swing's, and friction, which knows of a frame before."""
         return replace(terms, inertia=False, friction=False)
 
     def step(
         self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array
     ) -> tuple[Array, Codes]:
-        """z_S of the frame, the swing and its z_D. What is carried knows of no alpha."""
+        """Return z_S of the frame, the swing and its z_D. What is carried knows of no alpha."""
         shape, fixed = state.shape[:-1], self._static(params, static)
         state, matrices = state.reshape(-1, self.state).T, jnp.moveaxis(matrices.reshape(-1, *matrices.shape[-3:]), 0, -1)
         earlier, root, q, started = jnp.split(state, np.cumsum([6 * self.verts, 3, self.modes]))
@@ -101,12 +101,12 @@ class Swing:
         return replace(features, swing=self.swings(params, model, features))
 
     def codes(self, params: dict, model: Model, track: MotionFeatures) -> Codes:
-        """Of every frame, without a swing at its motion's start."""
+        """Return the codes of every frame, without a swing at its motion's start."""
         q = self.swings(params, model, track)
         return Codes(self._static(params, track.static), self._dynamic(params, q), q)
 
     def swings(self, params: dict, model: Model, track: MotionFeatures) -> Float[Array, "frames modes"]:
-        """q of every frame of motions end to end: sums over the garment `BLOCK` frames at a time, then the recurrence."""
+        """Return q of every frame of motions end to end: sums over the garment, `BLOCK` frames at a time, then a recurrence."""
         frames, h = len(track.start), 1 / model.fps
         z, number = self._static(params, track.static), jnp.arange(frames, dtype=track.start.dtype)
         block = min(BLOCK, frames)
@@ -139,7 +139,7 @@ class Swing:
         return lax.scan(step, (zero, zero), (inverse, g, g1, g2, push, number == track.start), unroll=4)[1]
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Of the last frames, time leading, whose swings the track knows."""
+        """Return the codes of the last frames, time leading, whose swings the track knows."""
         back = jnp.maximum(ends[None] - jnp.arange(last - 1, -1, -1, dtype=ends.dtype)[:, None], track.start[ends][None])
         q = track.swing[back]
         return Codes(self._static(params, track.static[back]), self._dynamic(params, q), q)
@@ -170,7 +170,7 @@ class Swing:
         return {"hold": value}, gradient
 
     def enlargement(self, track: MotionFeatures, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
-        """By how much the swings q of frames, enlarged, have the energy E_0 |q|^2 / 2 of the track's largest.
+        """Return by how much the swings q of frames, enlarged, have the energy E_0 |q|^2 / 2 of the track's largest.
 
         Most of a motion is quiet: so its poses are trained with swings as strong as any of the track's.
         """
@@ -181,7 +181,7 @@ class Swing:
     def hold(
         self, model: Model, moved: Float[Array, "verts 3 batch"], swing: Float[Array, "batch modes"]
     ) -> tuple[Float[Array, "batch"], Array]:
-        """The inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
+        """Return the inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
 
             sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i,   g_i = d_i^T M d_i
 

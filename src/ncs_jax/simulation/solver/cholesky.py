@@ -317,7 +317,7 @@ def _taken(group: Group, updates, k, top, bottom, left):
 
 
 def solve(order: Elimination, factor: Factor, right: Float[Array, "verts n"]) -> Float[Array, "verts n"]:
-    """x with A x = right; where the blocks are numbers, of each of the n columns by itself."""
+    """Return x with A x = right; where the blocks are numbers, of each of the n columns by itself."""
     groups = [g for level in order.levels for g in level]
     k = sum(inverse.shape[1] for inverse in factor.inverse) // sum(g.pivots.shape[1] for g in groups)
     columns = right.shape[1] // k

@@ -16,7 +16,7 @@ __all__ = ["conjugate_gradients"]
 def conjugate_gradients(
     matrix: Callable, preconditioner: Callable, right: Float[Array, "verts 3"], tolerance: float, most: int
 ) -> Float[Array, "verts 3"]:
-    """x with |matrix(x) - right| <= tolerance |right|, in at most `most` steps; ends early where the matrix is not definite.
+    """Return x with |matrix(x) - right| <= tolerance |right|, in at most `most` steps; fewer where it is not definite.
 
     Source: Nocedal and Wright 2006, algorithm 5.3.
     """

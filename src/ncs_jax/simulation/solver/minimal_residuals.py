@@ -16,7 +16,7 @@ __all__ = ["minimal_residuals"]
 def minimal_residuals(
     matrix: Callable, preconditioner: Callable, right: Float[Array, "verts 3"], tolerance: float, most: int
 ) -> tuple[Float[Array, "verts 3"], Float[Array, ""]]:
-    """x with |matrix(x) - right|_P <= tolerance |right|_P, in at most `most` steps, and what share of |right|_P is left.
+    """Return x with |matrix(x) - right|_P <= tolerance |right|_P, in at most `most` steps, and what share of |right|_P is left.
 
     The preconditioner P has to be positive definite, |r|_P^2 = r . P r; the matrix may be indefinite, as that of an equilibrium
     that is not stable. Source: Paige and Saunders 1975; Elman, Silvester and Wathen 2014, algorithm 4.1.

@@ -45,7 +45,7 @@ def _take(array, rows, filling=0, axis=0):
 
 
 def patch_around(score: Float[Array, "verts"], model: Model, couplings: Couplings) -> Patch:
-    """The patch near the vertices of the highest score: those that lie nearest to them at rest."""
+    """Return the patch near the vertices of the highest score: those that lie nearest to them at rest."""
     mesh = model.garment.mesh
     seeds = mesh.rest[jax.lax.top_k(score, SEEDS)[1]]
     square = jnp.sum((mesh.rest[:, None] - seeds[None]) ** 2, axis=-1)
@@ -90,7 +90,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
 
 
 def pairs_of(patch: Patch, pairs: Pairs) -> Pairs:
-    """Those that the patch moves; with `overflow` where they are too many."""
+    """Return those that the patch moves; with `overflow` where they are too many."""
     moves = patch.place < SIZE
 
     def some(vertices, most):
@@ -112,7 +112,7 @@ def solve_dense(
     right: Float[Array, "verts 3"],
     springs: tuple[Int[Array, "springs 4"], Float[Array, "springs 4 3"]] | None = None,
 ) -> Float[Array, "verts 3"]:
-    """x with A x = right where the patch moves, and zero elsewhere.
+    """Return x with A x = right where the patch moves, and zero elsewhere.
 
     springs: vertices and vectors v of what A has beside the blocks, sum v v^T.
     """

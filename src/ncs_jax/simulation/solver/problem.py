@@ -79,23 +79,23 @@ class Problem:
 
     @property
     def step(self) -> StepInputs:
-        """The inputs, their time step a number of the program: as an array its square would be rounded twice."""
+        """Return the inputs, their time step a number of the program: as an array its square would be rounded twice."""
         return replace(self.inputs, dt=1 / self.model.fps)
 
     @property
     def terms(self) -> Terms:
-        """Those that are minimised: pins that are held exactly are none."""
+        """Return those that are minimised: pins that are held exactly are none."""
         terms = self.model.terms
         return replace(terms, pinning=terms.pinning and self.pinned is None)
 
     @property
     def mass(self) -> Float[Array, "verts"]:
-        """Of the vertices, kg."""
+        """Return the vertices' masses, kg."""
         return self.model.material.density * self.model.garment.mesh.vertex_area
 
     @property
     def free(self) -> Bool[Array, "verts"] | None:
-        """Which vertices no exact pin holds; None: all."""
+        """Return which vertices no exact pin holds; None: all."""
         return None if self.pinned is None else jnp.ones(self.mass.shape, bool).at[self.model.garment.pins].set(False)
 
 
