@@ -53,8 +53,8 @@ def finer(scene: Scene, folder: Path, garment: int = 1, body: int = 1) -> Scene:
         for _ in range(round(np.log(body) / np.log(4))):
             points, faces, at = subdivide(points, faces, vertex_attributes={"weights": weights})
             weights = at["weights"]
-        given = {"joint_names": np.array(skinned.joint_names), "rest_rotations": skinned.rest_rotations}
-        given = {name: value for name, value in given.items() if value is not None and len(value)}
+        optional = {"joint_names": np.array(skinned.joint_names), "rest_rotations": skinned.rest_rotations}
+        given = {name: value for name, value in optional.items() if value is not None and len(value)}
         file = folder / f"body{body}.npz"
         write_npz(
             file, vertices=points, faces=faces.astype(np.int32), joints=skinned.joints, parents=skinned.parents,

@@ -229,7 +229,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[object]], width: int = 1
 def clocks(rows: dict[str, dict], extra: Sequence[str] = ()) -> str:
     """The table of rows: seconds compiling, then ms, the least that it could be, and how near the median comes to that."""
     heads = ["", "compile s", "repeats", "min ms", "median ms", "p99 ms", "max ms", "least ms", "% of limit", *extra]
-    lines = []
+    lines: list[list[object]] = []
     for name, row in rows.items():
         if "failed" in row:
             lines.append([f"{name}: {row['failed']}"])

@@ -49,7 +49,7 @@ def ready(scene: Scene) -> Assembly:
     """A scene as training takes it, with what its motions fix."""
     assembly = assemble(scene)
     give_back()  # as training does
-    return replace(assembly, track=with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
+    return replace(assembly, training_features=with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
 
 
 def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:

@@ -18,6 +18,7 @@ from ncs_jax.energies.contact.pairs import groups_from, nearby_pairs
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
 from ncs_jax.energies.total import contact_force, energies
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.io.tables.npz import write_npz
@@ -75,7 +76,7 @@ def specimen(scene: Scene) -> Specimen:
     return Specimen(
         rest, np.asarray(m.garment.mesh.faces), np.arange(0, len(rest), 50), three, posed(frame, 0.9 * drape),
         np.asarray(blend(a.track.matrices[frame], m.blend), np.float64),
-        np.asarray(pose_body(m, a.track.matrices[frame]), np.float64), np.asarray(m.surface.faces),
+        np.asarray(pose_body(m, a.track.matrices[frame]), np.float64), np.asarray(required(m.surface, "surface").faces),
         rng.standard_normal(rest.shape), material,
         {name: tuple(getattr(physics.membrane, k) for k in keys) for name, (_, keys) in MEMBRANES.items()}, 1 / m.fps,
     )  # fmt: skip
@@ -282,7 +283,7 @@ def limbs(scene: Scene) -> list[tuple[str, Assembly]]:
         for name, degrees in turned.items():
             poses[at_once, names.index(name)] = np.radians(degrees)
         record = replace(like, poses=poses, translation=at_once[:, None] * np.asarray(way, float))
-        return replace(a, track=features_from_records(a.model, record))
+        return replace(a, training_features=features_from_records(a.model, record))
 
     cases: dict[str, tuple] = {
         "arms through the torso": ({"LeftArm": (0, -170, 0), "RightArm": (0, 170, 0)},),

@@ -48,7 +48,8 @@ from ncs_jax.training.step import TrainState, chunk_runner, initial_state
 
 TOLERANCE = 1e-3
 # g; with 0.1, what is left out of balance may be a thousandth of the result where the cloth is taut and folds softly
-SETTINGS = Settings(tolerance=0.02, iterations=300)
+TOLERANCE = 0.02  # g
+SETTINGS = Settings(tolerance=TOLERANCE, iterations=300)
 LIMBS = replace(SETTINGS, tolerance=0.1)
 CELLS = ("gated", "swing")
 STATES = ("safe", "at risk", "broken", "refused")
@@ -290,7 +291,7 @@ def simulated_apart(axis: str, value: Any, made: Callable[[Any], Any]) -> dict:
         return a.track.relative(x) - np.asarray(a.track.matrices)[:, :1, :, 3], solution
 
     single, exact = made(jnp.float32), found(made(jnp.float64))
-    enough = rounding(single.model) <= SETTINGS.tolerance
+    enough = rounding(single.model) <= TOLERANCE
     x, solution = found(single) if enough else exact
     residual, off = float(np.max(solution.residual)), apart(x, exact[0])
     return cell(

@@ -143,8 +143,6 @@ def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
 def fitted(scene: Scene, altered: Callable[[Any, MotionFeatures], Method], steps: int) -> tuple[Run, float]:
     """As `trained`, of a network that no scene file names. Nothing is kept."""
     began, a, spec = time.monotonic(), assemble(scene), scene.training
-    if a.track is None:
-        raise InputError("a motion to train on expected", file=scene.source, field="motion.files")
     a = replace(a, network=altered(a.network, a.track))
     run, track, frames = chunk_runner(a.network, spec), with_bodies(a.model, a.track, spec.batch), len(a.track.start)
     state = initial_state(a.model, a.network, spec.seed)

@@ -15,6 +15,7 @@ from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.elements import elastic
 from ncs_jax.energies.terms import MEMBRANES, Garment, StepInputs, Terms
 from ncs_jax.energies.total import distances, energies, total
+from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.skinning import unpose
 
@@ -124,6 +125,27 @@ def test_a_frame_brings_only_what_is_asked_for(off, lacking):
     assert set(got) == set(NAMES) - set(off)
     for name, value in got.items():
         np.testing.assert_allclose(value, whole[name], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("term", "field"),
+    [
+        ("inertia", "step.previous"),
+        ("collision", "step.body"),
+        ("friction", "step.advected"),
+        ("pinning", "step.vertex_transforms"),
+        ("self_contact", "garment.groups"),
+    ],
+)
+def test_what_a_term_lacks_is_named(term, field):
+    x, garment, _, surface = situation()
+    alone = dataclasses.replace(ALL, **{**OFF, term: "plane" if term == "collision" else True})
+    bare = dataclasses.replace(garment, groups=None)
+    with pytest.raises(InputError, match=f"^{field}: missing"):
+        energies(x, bare, material(), StepInputs(), alone, surface)
+    if term == "collision":
+        with pytest.raises(InputError, match=r"^surface: missing"):
+            energies(x, garment, material(), StepInputs(body=x), alone)
 
 
 def test_too_many_pairs_are_no_number():

@@ -253,7 +253,7 @@ def test_half_a_garment_that_is_nan_and_no_body(tmp_path, swing):
         (lambda a: replace(a, up=(0.0, 0.0, 0.0)), "up"),
         (lambda a: replace(a, body=PosedBody(a.body.vertices[:2], a.body.faces)), "body"),
         (lambda a: PosedBody(a.body.vertices[0], a.body.faces), "body"),
-        (lambda a: PosedBody(a.body.vertices, None), "body_faces"),
+        (lambda a: replace(a.body, faces=None), "body_faces"),
         (lambda a: PosedBody(a.body.vertices, a.body.faces - 1), "body_faces"),
         (lambda a: PosedBody(a.body.vertices, a.body.faces, worn=-1), "worn"),
         (lambda a: PosedBody(a.body.vertices, a.body.faces, worn=10_000), "worn"),

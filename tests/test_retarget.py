@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.cli import main
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import to_rest_axes
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
@@ -348,6 +348,9 @@ def test_what_cannot_be_retargeted_says_why(rng):
         InputError, match=r"poses: the body's 7 joints expected, or names and a skeleton.*called mixamorig:Hips.*bvh"
     ):
         with_skeleton(replace(motion, joints=None, parents=None), 7)
+    for lacking in ({"joints": None}, {"parents": None}):
+        with pytest.raises(InputError, match=f"^{next(iter(lacking))}: missing.*with_skeleton"):
+            retarget(replace(motion, **lacking), body)
     with pytest.raises(InputError, match="2 joints"):
         retarget_to_body(MotionRecord(np.zeros((3, 2, 3)), np.zeros((3, 3)), 30.0), body, MotionSpec())
 
@@ -370,16 +373,17 @@ def test_what_leads_into_a_motion_is_left_out(rng):
 
 def bvh(motion: MotionRecord, tips: float = 0.1) -> str:
     """The text of a .bvh file."""
+    joints, parents = required(motion.joints, "joints"), required(motion.parents, "parents")
     children: dict[int, list[int]] = {}
-    for j, p in enumerate(motion.parents.tolist()):
+    for j, p in enumerate(parents.tolist()):
         children.setdefault(p, []).append(j)
     order: list[int] = []
 
     def lines(j: int):
         order.append(j)
-        offset = motion.joints[j] - (motion.joints[motion.parents[j]] if motion.parents[j] >= 0 else 0)
-        yield f"{'JOINT' if motion.parents[j] >= 0 else 'ROOT'} {motion.joint_names[j]}"
-        places = "" if motion.parents[j] >= 0 else "Xposition Yposition Zposition "
+        offset = joints[j] - (joints[parents[j]] if parents[j] >= 0 else 0)
+        yield f"{'JOINT' if parents[j] >= 0 else 'ROOT'} {motion.joint_names[j]}"
+        places = "" if parents[j] >= 0 else "Xposition Yposition Zposition "
         yield "{ OFFSET " + " ".join(f"{v:.6f}" for v in offset)
         yield f"CHANNELS {6 if places else 3} {places}Zrotation Xrotation Yrotation"
         for child in children.get(j, []):
@@ -388,7 +392,7 @@ def bvh(motion: MotionRecord, tips: float = 0.1) -> str:
 
     head = "\n".join(["HIERARCHY", *lines(0)])
     angles = np.stack([Rotation.from_rotvec(motion.poses[:, j]).as_euler("ZXY", degrees=True) for j in order], axis=1)
-    rows = np.concatenate([motion.translation + motion.joints[0], angles.reshape(len(angles), -1)], axis=1)
+    rows = np.concatenate([motion.translation + joints[0], angles.reshape(len(angles), -1)], axis=1)
     numbers = "\n".join(" ".join(f"{v:.6f}" for v in row) for row in rows)
     return f"{head}\nMOTION\nFrames: {len(angles)}\nFrame Time: {1 / motion.fps:.7f}\n{numbers}\n"
 

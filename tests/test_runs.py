@@ -133,6 +133,8 @@ def test_a_run_is_not_overwritten(tmp_path, plain_jax):
     assert run.steps == 10
     vertices = run.animate(str(tmp_path / "swing.npz"), alpha=1)
     assert vertices.shape == (24, 30, 3) and np.isfinite(vertices).all()
+    with pytest.raises(InputError, match=r"track: .*assemble its scene"):
+        _ = run.assembly.track
 
 
 def test_a_checkpoint_of_orbax_0_is_read_and_gone_on_with(tmp_path, plain_jax):

@@ -10,9 +10,11 @@ import pytest
 from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import energies
+from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.model import pose_body
 from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.step_inputs import step_inputs
 from ncs_jax.training.batches import CHUNK, batches, chunks
 from ncs_jax.training.loss import physics, with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
@@ -119,13 +121,20 @@ def test_what_a_scene_lacks_is_not_traced(plain_jax, changes, absent):
     assert ("dynamic" in initial_state(assembly.model, assembly.network, 0).params) == (not still)
 
 
+def test_friction_asks_for_a_past():
+    assembly = prepared()[0]
+    model = dataclasses.replace(assembly.model, terms=dataclasses.replace(assembly.model.terms, friction=True))
+    with pytest.raises(InputError, match=r"past\.unposed: missing"):
+        step_inputs(model, assembly.track.matrices[0])
+
+
 def test_a_body_posed_once_for_all_frames_gives_the_same_step(monkeypatch):
     assembly, spec, ends, pairs = prepared()
     params = initial_state(assembly.model, assembly.network, 0).params
     track = with_bodies(assembly.model, assembly.track, 3)
     assert track.bodies.shape == (len(track.start), len(assembly.model.body), 6)
     expected, energies, _ = one_gradient(assembly, spec, params, ends[0], pairs[0])
-    found, parts, _ = one_gradient(dataclasses.replace(assembly, track=track), spec, params, ends[0], pairs[0])
+    found, parts, _ = one_gradient(dataclasses.replace(assembly, training_features=track), spec, params, ends[0], pairs[0])
     monkeypatch.setattr("ncs_jax.training.loss.BODIES", track.bodies.nbytes - 1)
     assert with_bodies(assembly.model, assembly.track, 3) is assembly.track
     for name, energy in energies.items():

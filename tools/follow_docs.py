@@ -21,6 +21,7 @@ from unittest import mock
 
 import numpy as np
 
+from ncs_jax.errors import required
 from tools.run_docs import ROOT, Sample, command_fault, samples, written_out
 
 STEPS = "3"
@@ -71,7 +72,7 @@ def furnish() -> None:
     lines = [f"v {x} {y} {z}" for x, y, z in shirt.vertices] + [f"f {a} {b} {c}" for a, b, c in shirt.faces + 1]
     Path("shirt.obj").write_text("\n".join(lines) + "\n")
     garment, motion = run.animate("ncs:walk"), run.motion("ncs:walk")
-    worn_by = run.assembly.body, motion
+    worn_by = required(run.assembly.body, "body"), motion
     io.write_animation("character.glb", garment, shirt.faces, 30.0, rest=shirt.vertices, worn_by=worn_by)
     io.write_animation("walk.npz", garment, shirt.faces, 30.0, rest=shirt.vertices)
     Path("dance.bvh").write_text(capture())
@@ -190,7 +191,7 @@ def _viewed(rest: list[str]) -> str:
     command = [sys.executable, "-m", "ncs_jax.cli", *rest, "--port", "8123"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as served:
         try:
-            line = next((line for line in served.stdout if "http" in line), "")
+            line = next((line for line in required(served.stdout, "stdout") if "http" in line), "")
         finally:
             served.terminate()
     return "" if line else "no page was served"

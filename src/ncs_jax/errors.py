@@ -1,10 +1,13 @@
-"""The one error that a user's input can cause."""
+"""The one error that a user's input can cause, and the check that what is asked for was given."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
-__all__ = ["InputError"]
+T = TypeVar("T")
+
+__all__ = ["InputError", "required"]
 
 
 class InputError(ValueError):
@@ -28,6 +31,13 @@ class InputError(ValueError):
         found = "" if value is None else f" (found {_short(value)})"
         text = f"{where}: {expected}{found}" if where else f"{expected}{found}"
         super().__init__(f"{text}; {mend}" if mend else text)
+
+
+def required(value: T | None, field: str, mend: str | None = None) -> T:
+    """Return a value that what is asked for needs; where it is None, raise an InputError that names it by `field`."""
+    if value is None:
+        raise InputError("missing, and needed here", field=field, mend=mend)
+    return value
 
 
 def _short(value: object, limit: int = 80) -> str:

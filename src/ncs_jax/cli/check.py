@@ -46,7 +46,7 @@ def check(options) -> int:
     print(f"degenerate triangles {parts.degenerate}")
     kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
     print(f"  file      {record.scale:g} m a unit, {record.up.upper()} up; {kept}")
-    if model.body is not None:
+    if assembly.body is not None and model.body is not None:
         print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
         print(f"  over      {name}: {len(layer.rest)} vertices")

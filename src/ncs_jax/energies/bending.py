@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import Mesh, corners, dihedral, spread
 from ncs_jax.geometry.numerics import arctan2, least_length
 from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, times
@@ -54,9 +55,9 @@ def fold_gradient(
     e = [minus(face[(k + 2) % 3], face[(k + 1) % 3]) for k in range(3)]
     normal = times(0.5 / area, cross(e[2], minus(face[2], face[0])))
 
-    around = jnp.stack(normal, axis=1)
-    n0, second = ([p[:, i] for i in range(3)] for p in (around[mesh.rings.sides[:, k]] for k in (0, 1)))
-    n1 = times(spread(mesh.rings.behind, second[0]), second)
+    rings, around = required(mesh.rings, "mesh.rings"), jnp.stack(normal, axis=1)
+    n0, second = ([p[:, i] for i in range(3)] for p in (around[rings.sides[:, k]] for k in (0, 1)))
+    n1 = times(spread(rings.behind, second[0]), second)
     a, b = corners(x, mesh.hinges[:, :2])
     edge = minus(b, a)
     long = length(edge)
@@ -68,8 +69,8 @@ def fold_gradient(
     squares = [dot(v, v) for v in e]
     s, t = [], []
     for k in range(3):
-        turn = spread(mesh.rings.turned[:, k], area)
-        s.append(turn * moment[mesh.rings.folds[:, k]] * length(e[k]) * 0.5 / area)
+        turn = spread(rings.turned[:, k], area)
+        s.append(turn * moment[rings.folds[:, k]] * length(e[k]) * 0.5 / area)
         t.append(-dot(e[(k + 2) % 3], e[k]) / jnp.where(squares[k] > 0, squares[k], 1))
     size = dot(normal, normal)
     solid = size > least_length(size.dtype)

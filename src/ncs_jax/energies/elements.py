@@ -18,6 +18,7 @@ from ncs_jax.energies.mass_spring import per_edge
 from ncs_jax.energies.membrane import per_face
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
 from ncs_jax.energies.total import energies
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import corners
 from ncs_jax.geometry.soa_vectors import plus
 
@@ -124,7 +125,7 @@ def elastic(
             else:
                 energy, pull = jax.vjp(lambda edge: per_edge(edge, mesh, *material.membrane), corners(x, mesh.edges))
                 (on_edges,) = pull(jnp.ones_like(energy))
-                gradient = _gathered(on_edges, mesh.rings.edges)
+                gradient = _gathered(on_edges, required(mesh.rings, "mesh.rings").edges)
             parts["membrane"] = jnp.sum(energy, axis=0)
     if terms.bending:
         with jax.named_scope("bending"):
@@ -132,7 +133,7 @@ def elastic(
             on_faces = [plus(a, b) for a, b in zip(on_faces, folds, strict=True)]
             parts["bending"] = jnp.sum(energy, axis=0)
     if face:
-        gradient = gradient + _gathered(on_faces, mesh.rings.faces)
+        gradient = gradient + _gathered(on_faces, required(mesh.rings, "mesh.rings").faces)
     return parts, gradient
 
 

@@ -20,6 +20,7 @@ from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import unpose
 
 __all__ = ["body_collision", "contact_force", "distances", "energies", "total"]
@@ -60,15 +61,22 @@ def contact_force(
     return jax.grad(body_collision)(x, body, surface, terms, material)
 
 
-def _self_contact(x, garment, material):
-    pairs = nearby_pairs(x, garment.mesh, garment.groups, material.self_thickness)
-    value = self_contact(x, pairs, material.self_thickness, material.self_contact)
+def _self_contact(x, garment: Garment, material: Material):
+    thickness = required(material.self_thickness, "material.self_thickness")
+    pairs = nearby_pairs(x, garment.mesh, required(garment.groups, "garment.groups"), thickness)
+    value = self_contact(x, pairs, thickness, required(material.self_contact, "material.self_contact"))
     return jnp.where(pairs.overflow, jnp.nan, value)
 
 
 def _counted(energy, moving):
     """An energy that only a pose with a past has."""
     return energy if moving is None else energy * moving
+
+
+def _friction(x, step: StepInputs, material: Material):
+    advected = required(step.advected, "step.advected")
+    pressed = required(step.lagged_normal_force, "step.lagged_normal_force")
+    return _counted(friction(x, advected, pressed, material.friction, step.dt), step.moving)
 
 
 def energies(
@@ -103,18 +111,18 @@ def energies(
             parts["bending"] = bending(x, mesh, material.bending)
     if terms.collision is not None:
         with jax.named_scope("collision"):
-            parts["collision"] = body_collision(x, step.body, surface, terms, material, step.normals)
+            body = required(step.body, "step.body"), required(surface, "surface")
+            parts["collision"] = body_collision(x, *body, terms, material, step.normals)
     if terms.friction:
         with jax.named_scope("friction"):
-            value = friction(x, step.advected, step.lagged_normal_force, material.friction, step.dt)
-            parts["friction"] = _counted(value, step.moving)
+            parts["friction"] = _friction(x, step, material)
     if terms.gravity:
         with jax.named_scope("gravity"):
             parts["gravity"] = gravity(x, mass, material.gravity)
     if terms.pinning:
         with jax.named_scope("pinning"):
             pins = garment.pins
-            unposed = unpose(step.vertex_transforms[pins], x[pins])
+            unposed = unpose(required(step.vertex_transforms, "step.vertex_transforms")[pins], x[pins])
             parts["pinning"] = pinning(unposed, mesh.rest[pins], material.pinning)
     for term in terms.own:
         with jax.named_scope(term.__name__):
@@ -124,7 +132,7 @@ def energies(
             parts["external"] = -jnp.sum(step.force * x, axis=(0, 1))
     if terms.inertia:
         with jax.named_scope("inertia"):
-            target = project(step.previous, step.before)
+            target = project(required(step.previous, "step.previous"), required(step.before, "step.before"))
             target = target if terms.through_time else lax.stop_gradient(target)
             parts["inertia"] = _counted(inertia(x, target, mass, step.dt), step.moving)
     if terms.self_contact:

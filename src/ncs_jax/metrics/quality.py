@@ -116,13 +116,13 @@ def _shape(model: Model, x) -> dict[str, Float[Array, ""]]:
     }
 
 
-def _penetration(model: Model, search: _Search, x, body) -> dict[str, Float[Array, ""]]:
+def _penetration(model: Model, surface: Surface, search: _Search, x, body) -> dict[str, Float[Array, ""]]:
     """How much of a garment is inside the body."""
     mesh, layered = model.garment.mesh, bool(model.under)
     if search.exact:
-        depth = _depth(x, body, model.surface, layered)
+        depth = _depth(x, body, surface, layered)
     else:
-        depth = -distances(x, body, model.surface, model.terms)
+        depth = -distances(x, body, surface, model.terms)
     result = {"penetrating": 100 * jnp.mean(depth > 0), "depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
     if search.middles is not None:
         between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
@@ -149,7 +149,8 @@ def _measure_frame(model: Model, search: _Search, frame: _Frame) -> dict[str, Fl
     result = {"total": total, **parts, **_shape(model, x)}
     result["out_of_balance"] = jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81
     if model.surface is not None:
-        result |= _penetration(model, search, x, step.body if terms.collision else pose_body(model, frame.matrices))
+        body = step.body if terms.collision else pose_body(model, frame.matrices)
+        result |= _penetration(model, model.surface, search, x, body)
     if search.groups is not None:
         through, overflow = intersecting(x, mesh, search.groups)
         result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
@@ -162,12 +163,12 @@ def _measure(model, exact, groups, middles, *frames):
     return lax.map(lambda frame: _measure_frame(model, search, _Frame(*frame)), frames)
 
 
-def _middles(model: Model) -> Surface:
+def _middles(model: Model, surface: Surface) -> Surface:
     """Return what the search for the nearest triangle knows of the middles of the edges."""
     mesh = model.garment.mesh
     between = np.asarray((mesh.rest[mesh.edges[:, 0]] + mesh.rest[mesh.edges[:, 1]]) / 2)
     body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
-    return surface_from(between, body, np.asarray(model.surface.faces))
+    return surface_from(between, body, np.asarray(surface.faces))
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {
@@ -203,7 +204,7 @@ def measure(
     if model.terms.self_contact if self_contact is None else self_contact:
         groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups
 
-    middles = _middles(model) if exact and model.surface is not None else None
+    middles = _middles(model, model.surface) if exact and model.surface is not None else None
 
     def block(first):
         t = np.minimum(np.arange(first, first + BLOCK), frames - 1)

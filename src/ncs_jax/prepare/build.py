@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ncs_jax import io
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.network.methods.method import Method
@@ -33,7 +33,7 @@ CELL = 8.0  # m; side of the grid from whose corners motions are measured
 
 @dataclass(frozen=True)
 class Assembly:
-    """A scene made ready. `body` and `garment` are the records as read; `track` holds all training motions end to end."""
+    """A scene made ready. `body` and `garment` are the records as read; `training_features` are what `track` gives."""
 
     scene: Scene
     prepared: Prepared
@@ -41,8 +41,18 @@ class Assembly:
     network: Method
     body: io.BodyRecord | None
     garment: io.GarmentRecord
-    track: MotionFeatures | None
+    training_features: MotionFeatures | None
     motions: dict[str, io.MotionRecord]
+
+    @property
+    def track(self) -> MotionFeatures:
+        """All training motions end to end.
+
+        Raises:
+            InputError: the scene is that of a loaded run, which is made ready without them.
+        """
+        mend = "a loaded run has no training motions: assemble its scene, ncs_jax.assemble(run.assembly.scene)"
+        return required(self.training_features, "track", mend)
 
 
 def build(
@@ -73,7 +83,8 @@ def build(
         model = replace(model, surface=surface_of(model, faces, track, scene.physics.collision.distance == "smooth"))
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size:
-            prepared = _with_vibrations(scene, prepared, model, faces, track)
+            known = required(track, "vibrations", "train again into a new folder")
+            prepared = _with_vibrations(scene, prepared, model, faces, known)
         vibrations = RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype))
         model = replace(model, vibrations=vibrations)
     return Assembly(scene, prepared, model, network_from(scene, model), files.body, files.garment, track, motions)
@@ -167,7 +178,7 @@ def _training_features(files: SceneFiles, model: Model, motions: list[io.MotionR
     return features_from_records(model, *motions)
 
 
-def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures | None) -> Prepared:
+def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures) -> Prepared:
     """Add the garment's vibrations, found with smooth contact, because a simulation converges with no other."""
     from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 

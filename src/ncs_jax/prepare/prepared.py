@@ -59,8 +59,8 @@ def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prep
     moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in motions)
     basis = _smooth_modes(files)
     if body is None:
-        weights = np.ones((len(garment.vertices), 1), np.float32)
-        return Prepared(np.zeros(1, np.int64), np.asarray(moves), weights, np.zeros(0, np.int64), basis)
+        alone = np.ones((len(garment.vertices), 1), np.float32)
+        return Prepared(np.zeros(1, np.int64), np.asarray(moves), alone, np.zeros(0, np.int64), basis)
     weights = garment.weights
     if weights is None:
         weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
@@ -113,20 +113,20 @@ def retarget(
     Raises:
         InputError: no names, names that do not match, or overrides that name no joint of the body.
     """
-    joints, names = joints or {}, body_names(body)
+    joints, names, rest = joints or {}, body_names(body), _skeleton(motion)[0]
     source, target, pairs = _paired(motion, body, joints)
     turns, places = _forward(motion)
     axes = _body_axes(body.joints, target)
-    quarter = _body_axes(motion.joints, source) @ axes.T
-    upright = up_rotation(up or motion.up or _up_axis(places, motion.joints, source), world)
+    quarter = _body_axes(rest, source) @ axes.T
+    upright = up_rotation(up or motion.up or _up_axis(places, rest, source), world)
     align = _alignment(motion, body, source, target, pairs, quarter, axes)
     world_turns, local = _driven(turns, body, pairs, upright, align)
 
-    legs = _leg_length(source, motion.joints)
+    legs = _leg_length(source, rest)
     scaled_by = "as the scene says" if scale else "by the legs" if legs > 0 else "by the trunk"
-    scale = scale or _leg_ratio(motion, body, source, target)
+    scale = scale or _leg_ratio(rest, body, source, target)
     hips_s, hips_t = source.roles["hips"], target.roles["hips"]
-    home = body.joints[hips_t] - scale * quarter.T @ motion.joints[hips_s]
+    home = body.joints[hips_t] - scale * quarter.T @ rest[hips_s]
     bodily = replace(motion, poses=local, translation=np.zeros((len(turns), 3)), joints=body.joints, parents=body.parents)
     offsets = _forward(bodily, world_turns)[1]  # with the root at its rest place
     translation = home + scale * places[:, hips_s] @ upright.T - offsets[:, hips_t]
@@ -155,7 +155,7 @@ def _paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -
             "a body with joint names expected, as the motion has another skeleton", field="joint_names", value="none",
             mend="write joint_names (J,) into the body's file",
         )  # fmt: skip
-    source, target = anatomy(motion.joint_names, motion.parents.tolist()), anatomy(names, body.parents.tolist())
+    source, target = anatomy(motion.joint_names, _skeleton(motion)[1].tolist()), anatomy(names, body.parents.tolist())
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
     if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
@@ -216,8 +216,15 @@ def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[st
     return dict(sorted(pairs.items()))
 
 
+def _skeleton(motion: MotionRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Return a motion's joints at rest and their parents."""
+    mend = "give it a skeleton: see with_skeleton"
+    return required(motion.joints, "joints", mend), required(motion.parents, "parents", mend)
+
+
 def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return world rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
+    joints, parents = _skeleton(motion)
     given = turns is not None
     if turns is None:
         turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix()
@@ -225,13 +232,13 @@ def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.
         if motion.rest_rotations is not None:
             turns = motion.rest_rotations @ turns @ np.swapaxes(motion.rest_rotations, 1, 2)
     places = np.zeros(motion.poses.shape)
-    for j, parent in enumerate(motion.parents):
+    for j, parent in enumerate(parents):
         if parent < 0:
-            places[:, j] = motion.joints[j] + motion.translation
+            places[:, j] = joints[j] + motion.translation
             continue
         if not given:
             turns[:, j] = turns[:, parent] @ turns[:, j]
-        places[:, j] = places[:, parent] + turns[:, parent] @ (motion.joints[j] - motion.joints[parent]).astype(np.float64)
+        places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent]).astype(np.float64)
     return turns, places
 
 
@@ -317,19 +324,19 @@ def _leg_length(of: Limbs, joints: np.ndarray) -> float:
     """Return the length from hip to ankle along the bones, the mean of both sides; NaN without legs."""
     lengths = []
     for side in ("left", "right"):
-        chain = [of.roles.get(f"{side} {part}") for part in ("thigh", "shin", "foot")]
-        if None not in chain:
+        chain = [of.roles[role] for part in ("thigh", "shin", "foot") if (role := f"{side} {part}") in of.roles]
+        if len(chain) == 3:
             lengths.append(np.linalg.norm(np.diff(joints[chain], axis=0), axis=1).sum())
     return float(np.mean(lengths)) if lengths else float("nan")
 
 
-def _leg_ratio(motion: MotionRecord, body: BodyRecord, source: Limbs, target: Limbs) -> float:
-    """Return metres on the body for each unit of the source: by the legs, else by the trunk from hips to head."""
-    ours, theirs = _leg_length(target, body.joints), _leg_length(source, motion.joints)
+def _leg_ratio(rest: np.ndarray, body: BodyRecord, source: Limbs, target: Limbs) -> float:
+    """Return metres on the body for a unit of the source, with joints at `rest`: by the legs, else by hips to head."""
+    ours, theirs = _leg_length(target, body.joints), _leg_length(source, rest)
     if not (np.isfinite(ours) and theirs > 0):
         ours, theirs = (
             float(np.linalg.norm(x[_top(a)] - x[a.roles["hips"]]))
-            for x, a in ((body.joints, target), (motion.joints, source))
+            for x, a in ((body.joints, target), (rest, source))
         )  # fmt: skip
     if not (ours > 0 and theirs > 0):
         raise InputError("legs or a trunk to tell the unit by expected", field="motion.scale", value=0, mend="give the scale")

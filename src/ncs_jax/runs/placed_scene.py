@@ -94,13 +94,14 @@ class PlacedScene:
 
     def rebuild_lists(self, params: dict) -> None:
         """Tell the search for the nearest vertex where the garment is now: it finds the same, several times as fast."""
-        if self.model.terms.collision != "plane" or not self.model.terms.exact:
+        surface, terms = self.model.surface, self.model.terms
+        if surface is None or terms.collision != "plane" or not terms.exact:
             return
         motions = self.assembly.track
         some = np.unique(np.linspace(0, motions.start.shape[0] - 1, SAMPLED).astype(int))
         part = replace(jax.tree.map(lambda a: a[some], motions), origin=None)
         cloth, body = map(np.asarray, self._pose(self.model, params, part))
-        surface = rebuild_lists(self.model.surface, list(zip(cloth, body, strict=True)))
+        surface = rebuild_lists(surface, list(zip(cloth, body, strict=True)))
         self.model = replace(self.model, surface=surface)
         self._everywhere = self.copied(self.model), self._everywhere[1]
 

@@ -103,9 +103,11 @@ class Run:
         """
         scene = self.assembly.scene
         motion = motion or next(iter((*scene.motion.validation, *scene.motion.files)), None)
-        if rank and motion is None:
-            raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
-        smaller = self.compressed(motion, rank=rank) if rank else self
+        smaller = self
+        if rank:
+            if motion is None:
+                raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+            smaller = self.compressed(motion, rank=rank)
         return export(
             smaller.assembly,
             smaller.params,

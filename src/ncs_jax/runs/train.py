@@ -61,10 +61,10 @@ def train(
     scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
     out = None if out is None else Path(out)
     facts = _facts(out, resume)
-    if facts is not None:
-        scene, seed = scene_from(facts["scene"], source=str(out / "run.json")), facts["seed"]
-        check_own(facts, out, terms, network)
     if out is not None:
+        if facts is not None:
+            scene, seed = scene_from(facts["scene"], source=str(out / "run.json")), facts["seed"]
+            check_own(facts, out, terms, network)
         check_writable(out)
     assembly = assemble(scene, terms=terms, network=network)
     give_back()

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
 
@@ -111,7 +111,8 @@ def pose_garment(
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
     """Return the touchable body in one frame or several, and the garments under this one, m."""
     lanes = (1,) * (matrices.ndim - 3)
-    body = skin(blend(matrices, model.body_blend), model.body.reshape(model.body.shape + lanes))
+    body, weights = required(model.body, "model.body"), required(model.body_blend, "model.body_blend")
+    body = skin(blend(matrices, weights), body.reshape(body.shape + lanes))
     if not model.under:
         return body
     rest = jnp.concatenate([layer.rest for layer in model.under])

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import contact_force
+from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.model import Model, pose_body
 
@@ -39,7 +40,7 @@ def step_inputs(
     Friction reads where the body alone carries the last positions, x_adv = R_t R_{t-1}^-1 x_{t-1}, and the contact force there.
 
     Args:
-        matrices: joint transforms from rest to pose. past: the garment before; None: it stands still there.
+        matrices: joint transforms from rest to pose. past: the garment before; None where no term asks for it.
         transforms: skinning transforms of the garment's vertices, where they are known; else from the model's weights.
         body: positions (m) and normals of `model.posed_bodies`, where they are known. force: external, N.
     """
@@ -53,7 +54,7 @@ def step_inputs(
         transforms = blend(matrices, model.blend)
     advected = lagged = None
     if terms.friction:
-        advected = skin(transforms, past.unposed)
+        advected = skin(required(transforms, "transforms"), required(past.unposed, "past.unposed"))
         lagged = _lagged_normal_force(model, advected, posed)
     inertia = terms.inertia or bool(terms.own)
     return StepInputs(

@@ -145,7 +145,8 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         matrices = matrices.at[:, :, 3].add(-origin)
         transforms = blend(matrices, model.blend)
         moving = (state.started & settings.inertia).astype(dtype)
-        past = Past(state.previous - origin, state.before - origin, state.unposed, moving)
+        previous = state.previous - origin
+        past = Past(previous, state.before - origin, state.unposed, moving)
         step = step_inputs(model, matrices, past, transforms=transforms, force=force)
         exact = settings.exact_pins and len(model.garment.pins) > 0
         pinned = skin(transforms, rest)[model.garment.pins] if exact else None
@@ -154,7 +155,7 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         problem = with_neighbours(problem, find_neighbours(problem, advected))
         start = _expected(problem, state, advected, transforms)
         if model.terms.self_contact:
-            last = jnp.where(state.started, hold_pins(problem, past.previous), start)
+            last = jnp.where(state.started, hold_pins(problem, previous), start)
             problem, start = _approached(problem, *map(lax.stop_gradient, (last, advected, start)))
         x, solution = equilibrium(settings, problem, start)
         unposed = unpose(transforms, x)

@@ -28,7 +28,8 @@ def with_bodies(model: Model, track: MotionFeatures, batch: int) -> MotionFeatur
 
     A motion fixes them; a step looks them up. Where they take more than `BODIES` bytes, each step poses those it sees.
     """
-    if model.terms.collision != "plane" or 2 * len(track.start) * model.body.nbytes > BODIES:
+    body = model.body
+    if body is None or model.terms.collision != "plane" or 2 * len(track.start) * body.nbytes > BODIES:
         return track
     return replace(track, bodies=jax.jit(posed_bodies, static_argnums=2)(model, track.matrices, batch))
 

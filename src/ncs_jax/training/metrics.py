@@ -29,7 +29,8 @@ def training_metrics(
     Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
     """
     codes = network.windows(params, track, ends, window, 1)
-    offsets = decode(network, params, model, *(c if c is None else c[-1] for c in (codes.together(), codes.swung())))
+    z, q = codes.together(), codes.swung()
+    offsets = decode(network, params, model, z[-1], None if q is None else q[-1])
     weights = garment_blend(network, params, model)
     mesh = model.garment.mesh
 

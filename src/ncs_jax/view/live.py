@@ -16,6 +16,7 @@ import numpy as np
 
 from ncs_jax.energies.contact.distance import triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.metrics.motion import unposed
@@ -95,10 +96,10 @@ def _motions(motion: str | None, spec) -> tuple[str, ...]:
 
 
 @jax.jit
-def _depth(model: Model, x, matrices):
+def _depth(model: Model, surface: Surface, x, matrices):
     body = pose_body(model, matrices)
-    index, _ = nearest_triangle(x, body, model.surface)
-    return -triangle_distance(x, body, model.surface, index)
+    index, _ = nearest_triangle(x, body, surface)
+    return -triangle_distance(x, body, surface, index)
 
 
 def vertex_values(
@@ -124,7 +125,7 @@ def vertex_values(
     origin = np.asarray(track.matrices[frame, 0, :, 3])
     local = jnp.asarray(track.relative(x[None])[0] - origin, model.basis.dtype)
     matrices = track.matrices[frame].at[:, :, 3].add(-origin)
-    return 1000 * np.maximum(np.asarray(_depth(model, local, matrices)), 0)
+    return 1000 * np.maximum(np.asarray(_depth(model, model.surface, local, matrices)), 0)
 
 
 def colour_bins(values: np.ndarray, faces: np.ndarray, most: float) -> np.ndarray:

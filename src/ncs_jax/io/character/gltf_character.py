@@ -123,7 +123,7 @@ def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (),
             above.append(node)
             node = int(nodes.parents[node])
         line += reversed(above)
-    moved = {(t.node, t.path): _sampled(t, times) for t in tracks if t.node in line}
+    moved = {} if times is None else {(t.node, t.path): _sampled(t, times) for t in tracks if t.node in line}
     world: dict[int, np.ndarray] = {}
     for node in line:
         own = nodes.fixed[node]

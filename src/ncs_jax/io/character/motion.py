@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.io.character.bvh import read_bvh
 from ncs_jax.io.character.fbx_character import fbx_motion
 from ncs_jax.io.character.gltf_character import gltf_motion
@@ -72,7 +72,7 @@ def read_motion(
     elif suffix in FORMATS[4:]:
         found = (fbx_motion if suffix == ".fbx" else gltf_motion)(name, clip)
         file, poses, translation, fps, names = Path(name), found.poses, found.translation, found.fps, found.joint_names
-        skeleton = MotionSkeleton(found.joints * scale, found.parents, None, found.rest_rotations)
+        skeleton = MotionSkeleton(required(found.joints, "joints") * scale, found.parents, None, found.rest_rotations)
     else:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
         file, poses, translation, fps = table.file, _rotations(table), table.array("trans"), table.number(*FPS)

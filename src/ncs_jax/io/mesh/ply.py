@@ -105,7 +105,8 @@ def _element(e: _Element, source: _Words | _Bytes) -> tuple[dict[str, np.ndarray
         rows = min(block, e.count - done) if not lists else max(1, min(block, e.count - done, source.left() // max(width, 1)))
         columns = iter(source.take(row, rows))
         found = [(next(columns) if p[2] else None, next(columns)) for p in e.properties]
-        same = np.all([found[i][0][:, 0] == found[i][0][0, 0] for i in lists], axis=0) if lists else np.ones(rows, bool)
+        sizes = [size[:, 0] for size, _ in found if size is not None]
+        same = np.all([size == size[0] for size in sizes], axis=0) if sizes else np.ones(rows, bool)
         good = rows if same.all() else int(np.argmin(same))
         source.at = begin + good * width
         for part, (_, column) in zip(parts, found, strict=True):

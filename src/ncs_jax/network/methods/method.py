@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
+from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import Blend
 from ncs_jax.network.decoder import Decoder, merge
 from ncs_jax.scene.descriptors import DESCRIPTORS
@@ -183,7 +184,7 @@ def decode(
     offsets = jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
     if swing is None:
         return offsets
-    return offsets + jnp.tensordot(model.vibrations.directions, swing, (-1, -1))
+    return offsets + jnp.tensordot(required(model.vibrations, "model.vibrations").directions, swing, (-1, -1))
 
 
 class FromCodes:

@@ -25,11 +25,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
+from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import blend
 from ncs_jax.network.encoders import StaticEncoder, SwingEncoder
 from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, decode, descriptor_sizes, garment_blend
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_garment
+from ncs_jax.scene.model import Model, RitzModes, pose_garment
 
 __all__ = ["Swing"]
 
@@ -141,7 +142,7 @@ class Swing:
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
         """Return the codes of the last frames, time leading, whose swings the track knows."""
         back = jnp.maximum(ends[None] - jnp.arange(last - 1, -1, -1, dtype=ends.dtype)[:, None], track.start[ends][None])
-        q = track.swing[back]
+        q = required(track.swing, "track.swing")[back]
         return Codes(self._static(params, track.static[back]), self._dynamic(params, q), q)
 
     def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
@@ -149,24 +150,24 @@ class Swing:
 
         The swing is the frame's own, or with motion augmentation any size of another frame's.
         """
-        ends, others = windows.ends, windows.ends
+        swing, ends, others = required(track.swing, "track.swing"), windows.ends, windows.ends
         if windows.axis is not None:
             others = lax.all_gather(ends, windows.axis, tiled=True)
         at = jnp.where(windows.own, ends, others[windows.others])
-        share = windows.number.astype(track.swing.dtype) / max(windows.augmented - 1, 1)
+        share = windows.number.astype(swing.dtype) / max(windows.augmented - 1, 1)
         share = jnp.where(windows.own, 1, share * self.enlargement(track, at))
-        q = share[:, None] * track.swing[at]
+        q = share[:, None] * swing[at]
         codes = Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
         z = codes.together()
         offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
         offsets, static = jnp.split(offsets, 2, axis=-1)
         moved = offsets - lax.stop_gradient(static)
-        frames = [offsets + jnp.tensordot(model.vibrations.directions, q, (-1, -1))]
+        frames = [offsets + jnp.tensordot(_vibrations(model).directions, q, (-1, -1))]
         return Offsets(frames, moved), Kept(z[None], q)
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return the energy `hold` of what the dynamic code adds to the offsets, and its derivative."""
-        value, gradient = self.hold(model, extra, kept.swing)
+        value, gradient = self.hold(model, extra, required(kept.swing, "kept.swing"))
         return {"hold": value}, gradient
 
     def enlargement(self, track: MotionFeatures, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
@@ -174,7 +175,7 @@ class Swing:
 
         Most of a motion is quiet: so its poses are trained with swings as strong as any of the track's.
         """
-        size = jnp.linalg.norm(track.swing, axis=1)
+        size = jnp.linalg.norm(required(track.swing, "track.swing"), axis=1)
         largest = jnp.max(size)
         return largest / jnp.maximum(jnp.maximum(size[frames], QUIET * largest), jnp.finfo(size.dtype).tiny)
 
@@ -191,12 +192,13 @@ class Swing:
         Args:
             moved: y, what the dynamic code adds to the offsets, m.
         """
-        d, mass = model.vibrations.directions, _mass(model)
+        vibrations, mass = _vibrations(model), _mass(model)
+        d = vibrations.directions
         along = (d * mass[:, None, None]).reshape(-1, self.modes)
         g = jnp.sum(along * d.reshape(along.shape), axis=0)
         along = along / g[None]
         r = along.T @ moved.reshape(len(along), -1)
-        inertia, force = (g * model.fps**2)[:, None] * r, model.vibrations.energy * swing.T
+        inertia, force = (g * model.fps**2)[:, None] * r, vibrations.energy * swing.T
         return jnp.sum(r * (inertia / 2 - force), axis=0), (along @ (inertia - force)).reshape(moved.shape)
 
     def _static_garment(self, params, model, z, matrices):
@@ -204,20 +206,24 @@ class Swing:
         weights = garment_blend(self, params, model)
         transforms = blend(matrices, weights)
         offsets = decode(self, params, model, z)
-        directions = model.vibrations.directions
+        directions = _vibrations(model).directions
         p = sum(transforms[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
         return pose_garment(model, offsets, matrices, weights), p
 
     def _stiff(self, model, g):
         """G (1 + c h) + h^2 E_0, poses last."""
         h = 1 / model.fps
-        return g * (1 + self.damping * h) + h * h * model.vibrations.energy * jnp.eye(self.modes, dtype=g.dtype)[..., None]
+        return g * (1 + self.damping * h) + h * h * _vibrations(model).energy * jnp.eye(self.modes, dtype=g.dtype)[..., None]
 
     def _static(self, params, descriptors):
         return jnp.asarray(self.static.apply({"params": params["static"]}, descriptors))
 
     def _dynamic(self, params, swing):
         return jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, swing))
+
+
+def _vibrations(model: Model) -> RitzModes:
+    return required(model.vibrations, "model.vibrations")
 
 
 def _mass(model: Model) -> Float[Array, "verts"]:

@@ -7,6 +7,7 @@ dense factorisations: it is compiled, mapped over batches and runs wherever JAX 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
+
+from ncs_jax.errors import required
 
 __all__ = ["Elimination", "Factor", "elimination", "factorise", "solve"]
 
@@ -195,15 +198,15 @@ def _group(nodes, own, borders, entering, order: _Order, deeper: _Deeper) -> Gro
                 columns[i, k] = lookup[local[i]]
         update = deeper.position[2 * np.asarray(nodes)[:, None] + np.arange(2)]
         children = update[:, :, None] * (deeper.widest + 1) + columns
-    array = lambda a: None if a is None else jnp.asarray(a, jnp.int32)  # noqa: E731
+    array = functools.partial(jnp.asarray, dtype=jnp.int32)
     return Group(
         pivots=array(local[:, :p]),
         border=array(local[:, p:]),
         blocks=array(mine),
         places=array(np.stack([front, place[front, order.late[mine]], order.place[order.early[mine]]], axis=1)),
         flipped=array(order.flipped[mine]),
-        children=array(children),
-        columns=array(columns),
+        children=None if children is None else array(children),
+        columns=None if columns is None else array(columns),
     )
 
 
@@ -309,8 +312,8 @@ def _entered(group: Group, rows, diagonal, off):
 def _taken(group: Group, updates, k, top, bottom, left):
     """The sum of what the two children of every front leave to its rows from `top` to `bottom`, its columns from `left` on."""
     size = updates.shape[-1]
-    rows = _scalars(group.children[:, :, top:bottom], k)
-    columns = _scalars(group.columns[:, :, left:], k)
+    rows = _scalars(required(group.children, "group.children")[:, :, top:bottom], k)
+    columns = _scalars(required(group.columns, "group.columns")[:, :, left:], k)
     taken = updates.reshape(-1).at[rows[..., :, None] * size + columns[..., None, :]].get(mode="promise_in_bounds")
     taken = lax.optimization_barrier(taken)
     return taken[:, 0] + taken[:, 1]

@@ -117,7 +117,7 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     mass = jnp.sum(problem.mass)
     usual = 0.1 if start.dtype == jnp.float32 else 0.001
     tolerance = usual if settings.tolerance is None else settings.tolerance
-    limit = jnp.where(problem.step.moving > 0, settings.iterations, settings.first)
+    limit = jnp.where(problem.moving > 0, settings.iterations, settings.first)
 
     def unfinished(state):
         *_, status, _, iteration = state

@@ -16,9 +16,11 @@ from ncs_jax.energies.contact.pairs import Pairs, nearby_pairs
 from ncs_jax.energies.contact.safe_steps import free_share, swept_share
 from ncs_jax.energies.contact.self_contact import Repulsion, repulsion
 from ncs_jax.energies.contact.smooth import Quadrics, nearby_quadrics
+from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import energies
+from ncs_jax.errors import required
 from ncs_jax.scene.model import Model
 from ncs_jax.simulation.solver.cholesky import Elimination, factorise
 from ncs_jax.simulation.solver.contact import Contact, evaluate_contact
@@ -71,7 +73,7 @@ class Problem:
 
     model: Model
     couplings: Couplings
-    order: Elimination
+    order: Elimination | None  # None: nothing is factorised here
     inputs: StepInputs  # with `moving` 0 where inertia is left out, and the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     neighbours: Neighbours | None = None
@@ -92,6 +94,21 @@ class Problem:
     def mass(self) -> Float[Array, "verts"]:
         """Return the vertices' masses, kg."""
         return self.model.material.density * self.model.garment.mesh.vertex_area
+
+    @property
+    def moving(self) -> Float[Array, ""]:
+        """1, or 0 in a static frame."""
+        return required(self.inputs.moving, "inputs.moving")
+
+    @property
+    def thickness(self) -> Float[Array, ""]:
+        """How near cloth comes to cloth, m."""
+        return required(self.model.material.self_thickness, "material.self_thickness")
+
+    @property
+    def surface(self) -> Surface:
+        """The touchable body."""
+        return required(self.model.surface, "model.surface")
 
     @property
     def free(self) -> Bool[Array, "verts"] | None:
@@ -130,24 +147,24 @@ def find_neighbours(problem: Problem, x: Float[Array, "verts 3"]) -> Neighbours 
     model = problem.model
     x, quadrics, pairs = lax.stop_gradient(x), None, None
     if model.terms.collision == "smooth":
-        quadrics = nearby_quadrics(x, lax.stop_gradient(problem.step.body), model.surface)
+        quadrics = nearby_quadrics(x, lax.stop_gradient(required(problem.step.body, "step.body")), problem.surface)
     if model.terms.self_contact:
-        pairs = nearby_pairs(x, model.garment.mesh, model.garment.groups, search_radius(problem))
+        pairs = nearby_pairs(x, model.garment.mesh, required(model.garment.groups, "garment.groups"), search_radius(problem))
     return None if quadrics is None and pairs is None else Neighbours(quadrics, pairs, x)
 
 
 def search_radius(problem: Problem):
     """Return how far the search for self-contact looks, m."""
-    return REACH * problem.model.material.self_thickness
+    return REACH * problem.thickness
 
 
 def trust_radius(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
     """Return how far a vertex may come from where neighbours were found, m, until what was left out could matter."""
     far = jnp.asarray(jnp.inf, x.dtype)
     if problem.model.terms.collision == "smooth":
-        far = 2 * problem.model.surface.spacing.astype(x.dtype)
+        far = 2 * problem.surface.spacing.astype(x.dtype)
     if problem.model.terms.self_contact:
-        far = jnp.minimum(far, (search_radius(problem) - problem.model.material.self_thickness) / 2)
+        far = jnp.minimum(far, (search_radius(problem) - problem.thickness) / 2)
     return far
 
 
@@ -175,7 +192,8 @@ def body_contact(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None
     if model.terms.collision is None:
         return None
     quadrics = None if problem.neighbours is None else problem.neighbours.quadrics
-    return evaluate_contact(x, problem.step.body, model.surface, model.material, model.terms, quadrics, problem.only)
+    body = required(problem.step.body, "step.body")
+    return evaluate_contact(x, body, problem.surface, model.material, model.terms, quadrics, problem.only)
 
 
 def evaluate(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
@@ -188,12 +206,12 @@ def evaluate(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
     if contact is not None:
         value, gradient = value + contact.energy, gradient + contact.gradient
     if pairs is not None:
-        material = model.material
-        found = repulsion(x, pairs, material.self_thickness)
-        value = value + jnp.where(pairs.overflow, jnp.nan, folds.energy(found, material.self_contact))
-        gradient = gradient + folds.gradient(found, x, material.self_contact)
-    if problem.pinned is not None:
-        gradient = jnp.where(problem.free[:, None], gradient, 0)
+        stiff = required(model.material.self_contact, "material.self_contact")
+        found = repulsion(x, pairs, problem.thickness)
+        value = value + jnp.where(pairs.overflow, jnp.nan, folds.energy(found, stiff))
+        gradient = gradient + folds.gradient(found, x, stiff)
+    if (free := problem.free) is not None:
+        gradient = jnp.where(free[:, None], gradient, 0)
     return Point(value, gradient, contact, found)
 
 
@@ -216,27 +234,29 @@ def stiffness_blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point)
     diagonal, off = stiffness(x, problem.couplings, model.garment, model.material, step, problem.terms, contact)
     # Without inertia the mass still holds what nothing else does: it damps the way to the static state, however short a frame.
     mass, dt = problem.mass, step.dt
-    dt = jnp.where(step.moving > 0, dt, jnp.maximum(dt, static_step(model)))
+    dt = jnp.where(problem.moving > 0, dt, jnp.maximum(dt, static_step(model)))
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / dt**2
-    if problem.pinned is not None:
-        off = jnp.where(jnp.all(problem.free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
+    if (free := problem.free) is not None:
+        off = jnp.where(jnp.all(free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
     if point.folds is not None:
-        diagonal = diagonal + folds.blocks(point.folds, x, model.material.self_contact)
+        stiff = required(model.material.self_contact, "material.self_contact")
+        diagonal = diagonal + folds.blocks(point.folds, x, stiff)
     return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
 
 
 def factor_stiffness(problem: Problem, x: Float[Array, "verts 3"], point: Point):
     """Return the Cholesky factor of `stiffness_blocks`."""
-    return factorise(problem.order, *stiffness_blocks(problem, x, point))
+    return factorise(required(problem.order, "order"), *stiffness_blocks(problem, x, point))
 
 
 def collision_free_step(problem: Problem, x: Float[Array, "verts 3"], p: Float[Array, "verts 3"]):
     """Return the share of the way p on which no cloth can pass through other cloth, or a patch come near what is not known."""
+    near = required(problem.neighbours, "neighbours")
     # what was not found is at least so far apart
-    left = search_radius(problem) - 2 * max_displacement(x, problem.neighbours.found_at)
+    left = search_radius(problem) - 2 * max_displacement(x, near.found_at)
     if problem.only is not None:
-        left = left - problem.model.material.self_thickness
-    share = free_share(x, p, problem.neighbours.pairs, jnp.maximum(left, 0))
+        left = left - problem.thickness
+    share = free_share(x, p, required(near.pairs, "neighbours.pairs"), jnp.maximum(left, 0))
     if problem.only is not None:
         return share
 

@@ -16,6 +16,7 @@ from ncs_jax.energies.bending import hinge_weight
 from ncs_jax.energies.contact.friction import SLIP, slipping
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import Mesh, corners, dihedral
 from ncs_jax.geometry.numerics import norm, normalize, positive_part
 
@@ -133,11 +134,12 @@ def _bending(x, mesh: Mesh, stiffness):
 
 def _friction(x, step: StepInputs, coefficient):
     """The blocks (verts, 3, 3) of friction, which is convex."""
-    along, normal = slipping(x, step.advected, step.lagged_normal_force)
+    pressed = required(step.lagged_normal_force, "step.lagged_normal_force")
+    along, normal = slipping(x, required(step.advected, "step.advected"), pressed)
     length, slip = norm(along), SLIP * step.dt
     within = jnp.eye(3, dtype=x.dtype)[None] - normal[:, :, None] * normal[:, None, :]
     way = jnp.where((length < slip)[:, None], 0, normalize(along))
-    push = coefficient * norm(step.lagged_normal_force) / jnp.maximum(length, slip)
+    push = coefficient * norm(pressed) / jnp.maximum(length, slip)
     push = push if step.moving is None else step.moving * push
     return push[:, None, None] * (within - way[:, :, None] * way[:, None, :])
 
@@ -203,7 +205,7 @@ def stiffness(
         diagonal = diagonal + _own(x, step, terms)
     if terms.pinning:
         pins = garment.pins
-        linear = step.vertex_transforms[pins][..., :3]
+        linear = required(step.vertex_transforms, "step.vertex_transforms")[pins][..., :3]
         inverse = jnp.linalg.inv(linear)
         square = jnp.einsum("pia,pib->pab", inverse, inverse, precision="highest")
         diagonal = diagonal.at[pins].add(2 * material.pinning * square)
