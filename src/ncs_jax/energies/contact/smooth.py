@@ -1,4 +1,4 @@
-"""Return the contact with a smooth body: collision, equation (12), to a surface whose distance has no steps and no kinks."""
+"""Contact with a smooth body: collision, equation (12), to a surface whose distance has no steps and no kinks."""
 
 from __future__ import annotations
 
