@@ -172,8 +172,8 @@ def _overlap(low, high, down, up):
 
 
 def overlapping_members(x, first, second, radius, most: int, moved=None):
-    """Find the members (i, j) whose boxes overlap and that share no vertex: at most `most` of them; how many there are; and whether
-    that is more than there is room for.
+    """Find the members (i, j) whose boxes overlap and that share no vertex: at most `most` of them; how many there are; and
+    whether that is more than there is room for.
 
     `first` and `second`: the vertices of the members, and their groups; where both are the same, every pair once. `moved`:
     where the vertices go; the boxes then hold the way.
