@@ -6,6 +6,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -23,8 +24,10 @@ from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.membrane import deformation
+from ncs_jax.energies.terms import Terms
 from ncs_jax.energies.total import distances
-from ncs_jax.geometry.mesh import corners
+from ncs_jax.errors import required
+from ncs_jax.geometry.mesh import Mesh, corners
 from ncs_jax.geometry.numerics import angle_between, arctan2, norm
 from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.geometry.soa_vectors import cross, dot, length
@@ -77,28 +80,20 @@ def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
     return depth.at[at].set(jnp.where(inside, deepest, -jnp.abs(deepest)))
 
 
-class _Frame(NamedTuple):
-    """One frame of an animation: the garment there and in the two frames before, m, and the joints there and before."""
+class _Frames(NamedTuple):
+    """Frames of an animation: the garment there and in the two frames before, m, and the joints there and before."""
 
-    x: Float[Array, "verts 3"]
-    previous: Float[Array, "verts 3"]
-    before: Float[Array, "verts 3"]
-    matrices: Float[Array, "joints 3 4"]
-    matrices_before: Float[Array, "joints 3 4"]
+    x: Float[Array, "frames verts 3"]
+    previous: Float[Array, "frames verts 3"]
+    before: Float[Array, "frames verts 3"]
+    matrices: Float[Array, "frames joints 3 4"]
+    matrices_before: Float[Array, "frames joints 3 4"]
 
-    def seen_from_root(self) -> tuple[_Frame, Float[Array, "1 3"]]:
-        """Return the frame seen from the root joint, where single precision is finest, and where that is."""
-        origin = self.matrices[:1, :, 3]
-        x, previous, before = self.x - origin, self.previous - origin, self.before - origin
-        return _Frame(x, previous, before, *(m.at[:, :, 3].add(-origin) for m in self[3:])), origin
-
-
-class _Search(NamedTuple):
-    """What is looked for in every frame."""
-
-    exact: bool  # penetration by exact distance
-    groups: Groups | None  # triangles through each other
-    middles: Surface | None  # of edges, inside the body
+    def seen_from_root(self) -> tuple[_Frames, Float[Array, "frames 3"]]:
+        """Return the frames seen from the root joint, where single precision is finest, and where that is."""
+        origin = self.matrices[:, 0, :, 3]
+        x, previous, before = (a - origin[:, None] for a in self[:3])
+        return _Frames(x, previous, before, *(m.at[..., 3].add(-origin[:, None]) for m in self[3:])), origin
 
 
 def _shape(model: Model, x) -> dict[str, Float[Array, ""]]:
@@ -116,51 +111,56 @@ def _shape(model: Model, x) -> dict[str, Float[Array, ""]]:
     }
 
 
-def _penetration(model: Model, surface: Surface, search: _Search, x, body) -> dict[str, Float[Array, ""]]:
-    """How much of a garment is inside the body."""
-    mesh, layered = model.garment.mesh, bool(model.under)
-    if search.exact:
-        depth = _depth(x, body, surface, layered)
-    else:
-        depth = -distances(x, body, surface, model.terms)
-    result = {"penetrating": 100 * jnp.mean(depth > 0), "depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
-    if search.middles is not None:
-        between = (x[mesh.edges[:, 0]] + x[mesh.edges[:, 1]]) / 2
-        deepest = jnp.max(_depth(between, body, search.middles, layered))
-        result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
-    return result
-
-
-def _measure_frame(model: Model, search: _Search, frame: _Frame) -> dict[str, Float[Array, ""]]:
+@jax.jit
+def _energies_and_shape(model: Model, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
+    """Measure every energy, how far the garment is out of balance, and its shape."""
     mesh, terms = model.garment.mesh, model.terms
-    frame, origin = frame.seen_from_root()
-    x, unposed = frame.x, None
-    if terms.friction:
-        unposed = unpose(blend(frame.matrices_before, model.blend), frame.previous)
-    step = step_inputs(model, frame.matrices, Past(frame.previous, frame.before, unposed))
-    parts, gradient, _ = energies_and_gradient(x, model.garment, model.material, step, terms, model.surface)
-    total = sum(parts.values(), start=jnp.zeros((), x.dtype))
-    mass = model.material.density * mesh.vertex_area
-    if terms.gravity:
-        lifted = gravity(origin, jnp.sum(mass, keepdims=True), model.material.gravity)
-        total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
-    heavy = mass > 0
-    square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
-    result = {"total": total, **parts, **_shape(model, x)}
-    result["out_of_balance"] = jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81
-    if model.surface is not None:
-        body = step.body if terms.collision else pose_body(model, frame.matrices)
-        result |= _penetration(model, model.surface, search, x, body)
-    if search.groups is not None:
-        through, overflow = intersecting(x, mesh, search.groups)
-        result["self_intersecting"] = jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
-    return result
+
+    def one(args):
+        frame, origin = args
+        unposed = unpose(blend(frame.matrices_before, model.blend), frame.previous) if terms.friction else None
+        step = step_inputs(model, frame.matrices, Past(frame.previous, frame.before, unposed))
+        parts, gradient, _ = energies_and_gradient(frame.x, model.garment, model.material, step, terms, model.surface)
+        total = sum(parts.values(), start=jnp.zeros((), frame.x.dtype))
+        mass = model.material.density * mesh.vertex_area
+        if terms.gravity:
+            lifted = gravity(origin[None], jnp.sum(mass, keepdims=True), model.material.gravity)
+            total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
+        heavy = mass > 0
+        square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
+        out_of_balance = jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81
+        return {"total": total, **parts, **_shape(model, frame.x), "out_of_balance": out_of_balance}
+
+    return lax.map(one, frames.seen_from_root())
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _measure(model, exact, groups, middles, *frames):
-    search = _Search(exact, groups, middles)
-    return lax.map(lambda frame: _measure_frame(model, search, _Frame(*frame)), frames)
+def _penetration(model: Model, exact: bool, middles: Surface | None, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
+    """Measure how much of a garment is inside the body; `middles`: of its edges too."""
+    edges, surface = model.garment.mesh.edges, required(model.surface, "model.surface")
+    layered = bool(model.under)
+
+    def one(frame):
+        x, body = frame.x, pose_body(model, frame.matrices)
+        depth = _depth(x, body, surface, layered) if exact else -distances(x, body, surface, model.terms)
+        result = {"penetrating": 100 * jnp.mean(depth > 0), "depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
+        if middles is not None:
+            deepest = jnp.max(_depth((x[edges[:, 0]] + x[edges[:, 1]]) / 2, body, middles, layered))
+            result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
+        return result
+
+    return lax.map(one, frames.seen_from_root()[0])
+
+
+@jax.jit
+def _intersections(mesh: Mesh, groups: Groups, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
+    """Measure how much of a garment passes through itself; NaN where the search ran out of room."""
+
+    def one(x):
+        through, overflow = intersecting(x, mesh, groups)
+        return jnp.where(overflow, jnp.nan, 100 * jnp.mean(through, dtype=x.dtype))
+
+    return {"self_intersecting": lax.map(one, frames.seen_from_root()[0].x)}
 
 
 def _middles(model: Model, surface: Surface) -> Surface:
@@ -198,26 +198,34 @@ def measure(
     Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
     taken to have been at rest.
     """
-    frames = len(vertices)
+    count = len(vertices)
     positions = track.relative(np.asarray(vertices)).astype(model.basis.dtype, copy=False)
-    groups = None
+    programs: list[Callable] = [functools.partial(_energies_and_shape, model)]
+    if model.surface is not None:
+        # By exact distance it is the same program whatever the terms: compiled once for all scenes of these meshes.
+        bare = replace(model, terms=Terms(), vibrations=None) if exact else model
+        programs.append(functools.partial(_penetration, bare, exact, _middles(model, model.surface) if exact else None))
     if model.terms.self_contact if self_contact is None else self_contact:
-        groups = groups_from(model.garment.mesh) if model.garment.groups is None else model.garment.groups
+        mesh = model.garment.mesh
+        programs.append(functools.partial(_intersections, mesh, model.garment.groups or groups_from(mesh)))
 
-    middles = _middles(model, model.surface) if exact and model.surface is not None else None
+    def block(first: int) -> _Frames:
+        t = np.minimum(np.arange(first, first + BLOCK), count - 1)
+        x, previous, before = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
+        return _Frames(x, previous, before, track.matrices[t], track.matrices[np.maximum(t - 1, 0)])
 
-    def block(first):
-        t = np.minimum(np.arange(first, first + BLOCK), frames - 1)
-        three = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
-        return jax.device_get(
-            _measure(model, exact, groups, middles, *three, track.matrices[t], track.matrices[np.maximum(t - 1, 0)])
-        )
+    def measured(program: Callable, first: int) -> dict[str, np.ndarray]:
+        return jax.device_get(program(block(first)))
 
-    first, *others = range(0, frames, BLOCK)
-    blocks = [block(first)]  # compiles
+    found = [measured(program, 0) for program in programs]  # compiles
+    tasks = [(program, first) for first in range(BLOCK, count, BLOCK) for program in programs]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps only one core busy
-        blocks += pool.map(block, others)
-    return {name: np.concatenate([b[name] for b in blocks])[:frames] for name in blocks[0]}
+        found += pool.map(measured, *zip(*tasks, strict=True)) if tasks else []
+    rows: dict[str, list] = {}
+    for part in found:
+        for name, values in part.items():
+            rows.setdefault(name, []).append(values)
+    return {name: np.concatenate(values)[:count] for name, values in rows.items()}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:

@@ -101,14 +101,15 @@ def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) ->
     if not decoder.modes:
         return decoder, params
 
-    @jax.jit  # one program to compile, not one an operation
-    def whole(local, modal, basis):
-        def added(a, c):
-            modal_part = jnp.matmul(basis, c.reshape(decoder.modes, -1), precision="highest")
-            return decoder.local * a + modal_part.reshape(a.shape)
-
-        return {name: added(local[name], modal[name]) for name in ("kernel", "bias")}
-
-    offsets = whole(params["offsets"], params["coefficients"], basis)
+    offsets = _merged(decoder, params["offsets"], params["coefficients"], basis)
     kept = {name: value for name, value in params.items() if name != "coefficients"}
     return Decoder(decoder.verts, decoder.sizes, 0, 1.0, decoder.dtype), {**kept, "offsets": offsets}
+
+
+@functools.partial(jax.jit, static_argnums=0)  # one program to compile, not one an operation
+def _merged(decoder: Decoder, local: dict, modal: dict, basis) -> dict:
+    def added(a, c):
+        modal_part = jnp.matmul(basis, c.reshape(decoder.modes, -1), precision="highest")
+        return decoder.local * a + modal_part.reshape(a.shape)
+
+    return {name: added(local[name], modal[name]) for name in ("kernel", "bias")}

@@ -35,21 +35,22 @@ def touchable(
     """
     from scipy.spatial import cKDTree
 
-    @jax.jit
-    def posed(local):
-        m = transforms(skeleton, forward(skeleton, local, jnp.zeros(3, local.dtype)))
-        return skin(blend(m, garment_blend), jnp.asarray(garment, local.dtype)), skin(
-            blend(m, body_blend), jnp.asarray(body, local.dtype)
-        )
-
     near = np.zeros(len(body), bool)
     rest = np.broadcast_to(np.eye(3), (len(skeleton.parents), 3, 3))
     dtype = skeleton.joints.dtype
+    worn = [(jnp.asarray(garment, dtype), garment_blend), (jnp.asarray(body, dtype), body_blend)]
     for local in [rest, *rotations]:
-        cloth, skin_ = posed(jnp.asarray(local, dtype))
-        distance, _ = cKDTree(np.asarray(cloth)).query(np.asarray(skin_), distance_upper_bound=reach)
+        cloth, skin_ = map(np.asarray, _posed(skeleton, worn, jnp.asarray(local, dtype)))
+        distance, _ = cKDTree(cloth).query(skin_, distance_upper_bound=reach)
         near |= np.isfinite(distance)
     return near
+
+
+@jax.jit
+def _posed(skeleton: Skeleton, worn, local) -> list[jax.Array]:
+    """Return vertices (m) posed by local rotations, of every pair of those at rest and their skinning weights."""
+    m = transforms(skeleton, forward(skeleton, local, jnp.zeros(3, local.dtype)))
+    return [skin(blend(m, weights), rest) for rest, weights in worn]
 
 
 COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
@@ -91,16 +92,18 @@ def covered_by_layers(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarr
 
 def surface_of(model: Model, faces, track: MotionFeatures | None, smooth: bool, samples: int = 8) -> Surface:
     """Return the touchable body as a surface, with its search prepared for what comes near in some poses of the motion."""
-
-    def posed(matrices):
-        return skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
-
     poses = []
     if track is not None:
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
-        poses = list(zip(*map(np.asarray, jax.jit(jax.vmap(posed))(track.matrices[frames])), strict=True))
+        poses = list(zip(*map(np.asarray, _worn(model, track.matrices[frames])), strict=True))
     rest, body = np.asarray(model.garment.mesh.rest), np.concatenate([model.body, *(layer.rest for layer in model.under)])
     return surface_from(rest, body, faces, smooth=smooth, posed=poses)
+
+
+@jax.jit
+def _worn(model: Model, matrices) -> tuple[jax.Array, jax.Array]:
+    """Return the rest garment, skinned, and the body in several frames, m."""
+    return jax.vmap(lambda m: (skin(blend(m, model.blend), model.garment.mesh.rest), pose_body(model, m)))(matrices)
 
 
 def touchable_part(scene, body, garment, weights, records) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import fields, replace
 
@@ -41,9 +42,6 @@ class PlacedScene:
         self._chunk = chunk_runner(network, spec, self.mesh)
         self._compiled: dict[int, Callable] = {}
         self._everywhere = copied(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
-        self._metrics = jax.jit(lambda *args: training_metrics(args[0], network, spec.window, *args[1:]))
-        self._pose = jax.jit(lambda model, *args: _garment_and_body(model, network, *args))
-        self._told = jax.jit(lambda *args: _told(network, *args)) if network.refreshes else None
 
     @property
     def devices(self) -> int:
@@ -78,7 +76,8 @@ class PlacedScene:
     def measure(self, params: dict, done: int) -> dict[str, float]:
         """Return `training_metrics` of a few frames of the last of the `done` steps."""
         ends = self._ends(done - 1, 1)[0, :SEEN]
-        return {k: float(v) for k, v in self._metrics(self.model, params, self.features, ends).items()}
+        network, window = self.assembly.network, self.assembly.scene.training.window
+        return {k: float(v) for k, v in _metrics(self.model, network, window, params, self.features, ends).items()}
 
     def diagnose(self, state: TrainState) -> str:
         """Return why the last dropped step was dropped."""
@@ -86,8 +85,8 @@ class PlacedScene:
 
     def refresh(self, params: dict) -> None:
         """Tell the motions what the network tells them now, if it tells them anything: see `Method.refresh`."""
-        if self._told is not None:
-            told = self._told(params, self.model, self.assembly.track)
+        if self.assembly.network.refreshes:
+            told = _told(self.assembly.network, params, self.model, self.assembly.track)
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
@@ -100,7 +99,7 @@ class PlacedScene:
         motions = self.assembly.track
         some = np.unique(np.linspace(0, motions.start.shape[0] - 1, SAMPLED).astype(int))
         part = replace(jax.tree.map(lambda a: a[some], motions), origin=None)
-        cloth, body = map(np.asarray, self._pose(self.model, params, part))
+        cloth, body = map(np.asarray, _garment_and_body(self.model, self.assembly.network, params, part))
         surface = rebuild_lists(surface, list(zip(cloth, body, strict=True)))
         self.model = replace(self.model, surface=surface)
         self._everywhere = self.copied(self.model), self._everywhere[1]
@@ -122,11 +121,16 @@ class PlacedScene:
         return self._compiled[count]
 
 
+_metrics = jax.jit(training_metrics, static_argnums=(1, 2))
+
+
+@functools.partial(jax.jit, static_argnums=1)
 def _garment_and_body(model: Model, network: Method, params: dict, motions: MotionFeatures) -> tuple[Array, Array]:
     """Return the vertices of the garment, static, and of the body in every frame."""
     return animate(model, network, params, motions, None), jax.vmap(lambda at: pose_body(model, at))(motions.matrices)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _told(network: Method, params: dict, model: Model, motions: MotionFeatures) -> dict[str, Array]:
     """Return the fields that `refresh` changes, and no others: a compiled program would copy them."""
     new = network.refresh(params, model, motions)
