@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from ncs_jax.energies.terms import MEMBRANES, Material
 
@@ -10,7 +11,7 @@ DOWN = (0.0, 0.0, -9.81)
 
 
 def material(model="stvk", gravity=DOWN):
-    array = jnp.asarray
+    array = lambda number: jnp.asarray(np.asarray(number))  # noqa: E731 - with a type that holds, as that of a batch does
     numbers = {"lam": 41.8, "mu": 22.2, "stretch": 40.0, "shear": 20.0, "stiffness": 60.0}
     return Material(
         density=array(0.15),
