@@ -108,7 +108,7 @@ _gradient = jax.jit(_of_a_step, static_argnums=(0, 1))
 
 def lowered(assembly, spec, ends, pairs):
     """Return the text of the program of a chunk of steps, the names of its parts included."""
-    state = initial_state(assembly.model, assembly.network, 0)
+    state = jax.eval_shape(lambda model: initial_state(model, assembly.network, 0), assembly.model)
     runner = chunk_runner(assembly.network, spec)
     # Plain leaves: JAX fills the containers of a lowered program's arguments with what is not an array.
     leaves, tree = jax.tree.flatten((state, ends, pairs, 10, assembly.model, assembly.track))
