@@ -104,13 +104,6 @@ def test_a_term_that_breaks_is_named(folder, plain_jax):
     assert reports[-1].dropped == 10 and "broken is not finite at vertex 4" in reports[-1].message
 
 
-def test_the_simulation_is_in_balance_with_a_term(folder, plain_jax):
-    tables = {"garment": {"file": "cloth.npz", "pins": "pins"}, "motion": {"files": [], "fps": 30}}
-    x = [ncs_jax.simulate(scene(folder, **tables), terms=terms) for terms in ((), (hook, push))]
-    assert all(found.residual.max() < 0.1 for found in x)
-    assert np.mean(x[1].vertices[..., 0] - x[0].vertices[..., 0]) > 0.002
-
-
 def test_without_them_the_program_is_the_same(folder, plain_jax):
     text = []
     for terms, network in (((), None), ((push,), None), ((), network_from)):
@@ -123,17 +116,9 @@ def test_without_them_the_program_is_the_same(folder, plain_jax):
 
 
 def test_a_network_of_ones_own(folder, tmp_path, plain_jax):
-    run = ncs_jax.train(scene(folder), tmp_path / "run", steps=20, network=plain)
+    run = ncs_jax.train(scene(folder), tmp_path / "run", steps=10, network=plain)
     motion = str(folder / "swing.npz")
     with pytest.raises(InputError, match="plain"):
         ncs_jax.load_run(tmp_path / "run")
     again = ncs_jax.load_run(tmp_path / "run", network=plain)
     np.testing.assert_array_equal(again.animate(motion), run.animate(motion))
-    init, step = ncs_jax.stepper(run.assembly.model, run.assembly.network, run.params)
-    record = run.motion(motion)
-    turns = ncs_jax.local_rotations(run.assembly.model, jnp.asarray(record.poses))
-    state, streamed = init(), []
-    for turn, place in zip(turns, jnp.asarray(record.translation), strict=True):
-        state, x = step(state, turn, place)
-        streamed.append(x)
-    np.testing.assert_allclose(np.stack(streamed), run.animate(motion), atol=1e-5)

@@ -13,7 +13,19 @@ from jaxtyping import Array, Float, Int
 from ncs_jax.geometry.numerics import least_length
 from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, plus, times
 
-__all__ = ["LINE", "Mesh", "Rings", "corners", "dihedral", "material_axes", "mesh_from", "spread", "topology", "vertex_rings"]
+__all__ = [
+    "LINE",
+    "Mesh",
+    "Rings",
+    "corners",
+    "dihedral",
+    "material_axes",
+    "mesh_from",
+    "spread",
+    "topology",
+    "vertex_rings",
+    "with_middles",
+]
 
 LINE = 2e-6  # rest height of a face, of its longest edge, up to which it is a line: float32 positions resolve no more
 
@@ -272,3 +284,9 @@ def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
     """Return the faces around each vertex (verts, most), padded with len(faces): a gather over them replaces a scatter."""
     places = _places(np.asarray(faces), verts)
     return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)
+
+
+def with_middles(x, edges):
+    """Return vertices (verts, 3) followed by the middles of edges (edges, 2), m: of arrays of NumPy or of JAX."""
+    numbers = jnp if isinstance(x, jax.Array) else np
+    return numbers.concatenate([x, x[edges].mean(axis=1)])

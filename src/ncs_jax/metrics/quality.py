@@ -27,7 +27,7 @@ from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import Terms
 from ncs_jax.energies.total import distances
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import Mesh, corners
+from ncs_jax.geometry.mesh import Mesh, corners, with_middles
 from ncs_jax.geometry.numerics import angle_between, arctan2, norm
 from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.geometry.soa_vectors import cross, dot, length
@@ -50,7 +50,7 @@ QUANTITIES = {
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
 
-DEEPEST = 64  # points of a frame that are asked a second time whether they are inside
+DEEPEST = 128  # points of a frame that are asked a second time whether they are inside
 
 
 def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3 3"]) -> Float[Array, "points"]:
@@ -134,20 +134,25 @@ def _energies_and_shape(model: Model, frames: _Frames) -> dict[str, Float[Array,
     return lax.map(one, frames.seen_from_root())
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _penetration(model: Model, exact: bool, middles: Surface | None, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
-    """Measure how much of a garment is inside the body; `middles`: of its edges too."""
-    edges, surface = model.garment.mesh.edges, required(model.surface, "model.surface")
-    layered = bool(model.under)
+@jax.jit
+def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
+    """Measure how much of a garment is inside the body.
+
+    surface: the body as vertices and middles of edges look for it, by exact distance; None: by the scene's own query.
+    """
+    verts = len(model.garment.mesh.rest)
 
     def one(frame):
         x, body = frame.x, pose_body(model, frame.matrices)
-        depth = _depth(x, body, surface, layered) if exact else -distances(x, body, surface, model.terms)
-        result = {"penetrating": 100 * jnp.mean(depth > 0), "depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
-        if middles is not None:
-            deepest = jnp.max(_depth((x[edges[:, 0]] + x[edges[:, 1]]) / 2, body, middles, layered))
-            result["middle_depth_max"] = 1000 * jnp.maximum(deepest, 0)
-        return result
+        if surface is None:
+            depth = -distances(x, body, required(model.surface, "model.surface"), model.terms)
+        else:
+            depth = _depth(with_middles(x, model.garment.mesh.edges), body, surface, bool(model.under))
+        parts = {"depth_max": depth[:verts]}
+        if surface is not None:
+            parts["middle_depth_max"] = depth[verts:]
+        deepest = {name: 1000 * jnp.maximum(jnp.max(part), 0) for name, part in parts.items()}
+        return {"penetrating": 100 * jnp.mean(depth[:verts] > 0), **deepest}
 
     return lax.map(one, frames.seen_from_root()[0])
 
@@ -163,12 +168,11 @@ def _intersections(mesh: Mesh, groups: Groups, frames: _Frames) -> dict[str, Flo
     return {"self_intersecting": lax.map(one, frames.seen_from_root()[0].x)}
 
 
-def _middles(model: Model, surface: Surface) -> Surface:
-    """Return what the search for the nearest triangle knows of the middles of the edges."""
-    mesh = model.garment.mesh
-    between = np.asarray((mesh.rest[mesh.edges[:, 0]] + mesh.rest[mesh.edges[:, 1]]) / 2)
+def _surface_of_all(model: Model) -> Surface:
+    """Return the body as vertices and middles of edges look for it."""
     body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
-    return surface_from(between, body, np.asarray(surface.faces))
+    faces = np.asarray(required(model.surface, "model.surface").faces)
+    return surface_from(np.asarray(with_middles(model.garment.mesh.rest, model.garment.mesh.edges)), body, faces)
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {
@@ -204,7 +208,7 @@ def measure(
     if model.surface is not None:
         # By exact distance it is the same program whatever the terms: compiled once for all scenes of these meshes.
         bare = replace(model, terms=Terms(), vibrations=None) if exact else model
-        programs.append(functools.partial(_penetration, bare, exact, _middles(model, model.surface) if exact else None))
+        programs.append(functools.partial(_penetration, bare, _surface_of_all(model) if exact else None))
     if model.terms.self_contact if self_contact is None else self_contact:
         mesh = model.garment.mesh
         programs.append(functools.partial(_intersections, mesh, model.garment.groups or groups_from(mesh)))

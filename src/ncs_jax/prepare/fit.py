@@ -14,7 +14,7 @@ from ncs_jax.energies.contact.distance import triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.mesh import topology
+from ncs_jax.geometry.mesh import topology, with_middles
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
@@ -218,11 +218,6 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
         held |= short > 0
         own = np.where(held[:, None], moved + short[:, None] * away, 0)
     return (rest + moved).astype(x.dtype)
-
-
-def with_middles(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return vertices (V, 3), followed by the middles of edges (E, 2)."""
-    return np.concatenate([x, x[edges].mean(axis=1)])
 
 
 # --- pins and weights -----------------------------------------------------------------------------------------------
