@@ -89,20 +89,19 @@ def unbroken(tmp_path_factory):
     out = folder / "run"
     start = time.monotonic()
     finish(command(scene, out))
-    start, again = time.monotonic(), folder / "again"
-    finish(command(scene, again))
-    return scene, out, again, time.monotonic() - start
+    return scene, out, time.monotonic() - start
 
 
 def test_a_seed_makes_a_run_repeatable_bit_for_bit(unbroken, plain_jax):
-    scene, out, again, _ = unbroken
-    assert same(out, again)
-    other = train(scene, None, steps=STEPS, seed=1)
-    assert not all(np.array_equal(a, b) for a, b in zip(leaves(out), jax.tree.leaves(other.params), strict=True))
+    """In another process too."""
+    scene, out, _ = unbroken
+    again, other = (jax.tree.leaves(train(scene, None, steps=STEPS, seed=seed).params) for seed in (0, 1))
+    assert all(np.array_equal(a, b) for a, b in zip(leaves(out), again, strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(leaves(out), other, strict=True))
 
 
 def test_killed_within_a_write_and_resumed(unbroken, tmp_path, plain_jax):
-    scene, reference, _, seconds = unbroken
+    scene, reference, seconds = unbroken
     out, done = killed_and_resumed(tmp_path, scene, ["write", 0.8 * seconds])
     assert done[0]
     assert same(out, reference)
@@ -113,7 +112,7 @@ def test_killed_within_a_write_and_resumed(unbroken, tmp_path, plain_jax):
 
 @pytest.mark.slow
 def test_killed_at_ten_moments_and_resumed(unbroken, tmp_path, plain_jax):
-    scene, reference, _, seconds = unbroken
+    scene, reference, seconds = unbroken
     moments = np.random.default_rng(7).uniform(0.1, 0.95, 8) * seconds
     kills = [*moments[:3], "write", *moments[3:6], "write", *moments[6:]]
     out, done = killed_and_resumed(tmp_path, scene, kills)
@@ -201,7 +200,7 @@ def test_killed_before_anything_was_prepared_a_run_goes_on(tmp_path, plain_jax):
 def test_minutes_choose_the_steps(tmp_path, plain_jax):
     scene, seen = write_scene(tmp_path), []
     began = time.monotonic()
-    run = train(scene, tmp_path / "run", minutes=0.25, report=seen.append)
+    run = train(scene, tmp_path / "run", minutes=0.1, report=seen.append)
     assert seen[-1].step == seen[-1].steps == run.steps and run.steps % 10 == 0
     assert time.monotonic() - began < 4 * 15  # an estimate, on a machine that may be doing other things
     assert seen[-1].validation is not None and seen[-1].left == 0
