@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 # Nearly all of the time goes into compiling programs that then run for milliseconds: code that is compiled four times
 # faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
-FAST = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 12  # from 0.12 on there is nothing else, and no such flag
+FAST = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+FAST += " --xla_cpu_use_fusion_emitters=false" * HAS_EMITTERS
 GIVEN = os.environ.get("XLA_FLAGS", "").replace(FAST, "").strip()
 AS_USERS = {**os.environ, "XLA_FLAGS": GIVEN}  # the environment of a process that compiles as users do
 if not os.environ.get("NCS_OPTIMISED"):
     os.environ["XLA_FLAGS"] = f"{FAST} {GIVEN}"  # before JAX starts; of a flag given twice, the last counts
 
 # For a program that runs for seconds: `jax.jit(f, compiler_options=OPTIMISED)`.
-OPTIMISED = {
-    "xla_backend_optimization_level": 3,
-    "xla_cpu_use_fusion_emitters": True,
-    "xla_llvm_disable_expensive_passes": False,
-}
+OPTIMISED = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+OPTIMISED |= {"xla_cpu_use_fusion_emitters": True} if HAS_EMITTERS else {}
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
