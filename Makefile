@@ -15,8 +15,9 @@ WORKERS = -n 2 --dist loadfile --no-loadscope-reorder
 test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(WORKERS) -m "not slow and not gpu"
+	$(BIN)/mypy > .venv/types 2>&1 & types=$$!; \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest $(WORKERS) -m "not slow and not gpu"; tests=$$?; \
+	wait $$types || { cat .venv/types; exit 1; }; exit $$tests
 
 # Slow tests too, and every program compiled as users compile it.
 test-all: .venv/ready
@@ -59,14 +60,16 @@ assets: .venv/ready
 	$(BIN)/pip install -q embreex
 	$(BIN)/python tools/make_assets.py
 
-.venv/installed: pyproject.toml $(wildcard constraints/*.txt)
+NEEDS = pyproject.toml $(wildcard constraints/*.txt)
+.venv/installed: $(NEEDS)
 	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[plots]'
 	touch $@
 
-.venv/ready: .venv/installed
+.venv/ready: $(NEEDS)
+	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[dev]'
-	touch $@
+	touch .venv/installed $@
 
 clean:
 	rm -rf .venv runs build dist .pytest_cache .ruff_cache .mypy_cache

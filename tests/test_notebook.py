@@ -10,7 +10,7 @@ from nbclient import NotebookClient
 from .conftest import AS_USERS
 from .scenes import SCENE, write_scene
 
-SHORT = ("steps, frames = 300, 40", "steps, frames = 20, 6")
+SHORT = ("steps, frames = 200, 12", "steps, frames = 20, 6")
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
