@@ -77,13 +77,20 @@ NUMBERS = {"stvk": (41.8, 22.2), "neo_hookean": (41.8, 22.2), "baraff_witkin": (
 BODY = ball(1, 0.1)
 
 
+def cloth(rolled: bool):
+    """A sheet, perhaps rolled up to a tube that is not quite closed: of one topology, so that both run one program."""
+    x, faces = sheet(4, 6, 0.05)
+    angle = x[:, 0] / 0.05
+    return np.stack([0.05 * np.sin(angle), x[:, 1], 0.05 * np.cos(angle)], axis=1) if rolled else x, faces
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def derivatives(terms, x, along, garment, numbers, frame, surface):
     def value(x):
         return sum(energies(x, garment, numbers, frame, terms, surface).values())
 
-    slope, second = jax.jvp(jax.grad(value), (x,), (along,))
-    return value(x), slope, second
+    (found, slope), (_, second) = jax.jvp(jax.value_and_grad(value), (x,), (along,))
+    return found, slope, second
 
 
 @pytest.mark.parametrize("term", TERMS)
@@ -92,10 +99,10 @@ def derivatives(terms, x, along, garment, numbers, frame, surface):
     seed=seeds, size=st.floats(-2, 2), stiffness=st.floats(-3, 4), density=st.floats(-2, 1), rate=st.floats(5, 240),
     now=st.sampled_from(FLAWS), rest=st.sampled_from(FLAWS[:6]), round_=st.booleans(),
 )  # fmt: skip
-@example(seed=0, size=1.0, stiffness=1.0, density=0.0, rate=5.0, now="stretched", rest="no area", round_=True)  # overflowed
+@example(seed=1, size=1.0, stiffness=1.0, density=0.0, rate=5.0, now="stretched", rest="no area", round_=True)  # overflowed
 def test_energy_and_two_derivatives_are_finite(term, seed, size, stiffness, density, rate, now, rest, round_):
     rng, terms = np.random.default_rng(seed), TERMS[term]
-    vertices, faces = tube(6, 4, 0.09, 0.2) if round_ else sheet(4, 6, 0.05)
+    vertices, faces = cloth(round_)
     scale = 10**size
     before = flawed(vertices, faces, rest, rng) * scale
     x = flawed(vertices + 0.01 * rng.standard_normal(vertices.shape), faces, now, rng) * scale
