@@ -30,9 +30,9 @@ def still(model, frames=4):
     return features_from_records(model, MotionRecord(np.zeros((frames, 2, 3)), np.zeros((frames, 3)), model.fps, ()))
 
 
-@pytest.fixture
-def assembly(tmp_path):
-    return assembled(tmp_path)
+@pytest.fixture(scope="module")
+def assembly(tmp_path_factory):
+    return assembled(tmp_path_factory.mktemp("scene"))
 
 
 def test_the_rest_garment_has_no_strain(assembly):
@@ -87,10 +87,11 @@ def test_the_winding_number_is_one_within_a_closed_surface_and_what_is_left_of_i
     away = rng.normal(size=(20, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     triangles = jnp.asarray(vertices[faces])
-    np.testing.assert_allclose(winding_number(jnp.asarray(0.09 * away), triangles), 1, atol=1e-6)
-    np.testing.assert_allclose(winding_number(jnp.asarray(0.11 * away), triangles), 0, atol=1e-6)
+    turns = jax.jit(winding_number)
+    np.testing.assert_allclose(turns(0.09 * away, triangles), 1, atol=1e-6)
+    np.testing.assert_allclose(turns(0.11 * away, triangles), 0, atol=1e-6)
     half = vertices[faces].mean(axis=1) @ [0.1, 0.7, 0.2] > 0  # of a surface that is the same seen from the other side
-    np.testing.assert_allclose(winding_number(jnp.zeros((1, 3)), triangles[half]), 0.5, atol=1e-6)
+    np.testing.assert_allclose(turns(np.zeros((1, 3)), triangles[half]), 0.5, atol=1e-6)
 
 
 def test_a_crease_of_a_garment_below_that_is_folded_too_far_does_not_turn_outside_into_inside():
@@ -106,7 +107,8 @@ def test_a_crease_of_a_garment_below_that_is_folded_too_far_does_not_turn_outsid
     out = np.array([np.sin(angle * tip), 0, np.cos(angle * tip)])
     points = np.array([0.15 * out, -0.105 * out, -0.095 * out, [0, 0, 0]]) + [0, 0.24, 0]
     surface = surface_from(points, np.asarray(body), faces)
-    single, layered = (np.asarray(_depth(jnp.asarray(points, jnp.float32), body, surface, worn)) for worn in (False, True))
+    depth = jax.jit(_depth, static_argnums=3)
+    single, layered = (np.asarray(depth(jnp.asarray(points, jnp.float32), body, surface, worn)) for worn in (False, True))
     assert single[0] > 0.015, "by the pseudo-normal alone it is inside"
     np.testing.assert_allclose(layered[0], -single[0], rtol=1e-6)
     np.testing.assert_allclose(layered[1:], single[1:])
