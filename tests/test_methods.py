@@ -24,6 +24,9 @@ from ncs_jax.scene.spec import load_scene, scene_from
 from .ready import edited, lowered, prepared, ready, run, scopes
 from .scenes import write_scene
 
+codes_of = jax.jit(lambda network, *inputs: network.codes(*inputs), static_argnums=0)
+windows_to = jax.jit(lambda network, *inputs: network.windows(*inputs), static_argnums=(0, 4, 5))
+
 METHODS = {"ncs": NCS, "pbns": PBNS, "snug": SNUG, "swing": Swing}
 
 
@@ -48,29 +51,31 @@ def test_a_stream_and_a_smaller_decoder_give_what_the_sequence_gives(method):
 def test_a_window_that_reaches_back_to_the_start_is_the_motion(method):
     assembly, params, motion = ready(method=method)
     track, ends = features_from_records(assembly.model, motion), jnp.array([5, 9], jnp.int32)
-    whole = assembly.network.codes(params, assembly.model, track)
-    for of_all, of_windows in zip(whole, assembly.network.windows(params, track, ends, 10, 3), strict=True):
+    whole = codes_of(assembly.network, params, assembly.model, track)
+    for of_all, of_windows in zip(whole, windows_to(assembly.network, params, track, ends, 10, 3), strict=True):
         assert (of_all is None) == (of_windows is None)
         if of_all is not None:
             np.testing.assert_allclose(of_windows[:, 1], of_all[7:10], rtol=0, atol=1e-13)
     # one that would begin before the motion holds its first frame still: no motion yet
     if method != "snug":  # whose state is not at rest there
-        np.testing.assert_allclose(assembly.network.windows(params, track, ends, 10, 3)[0][:, 0], whole[0][3:6], atol=1e-13)
+        found = windows_to(assembly.network, params, track, ends, 10, 3)[0][:, 0]
+        np.testing.assert_allclose(found, whole[0][3:6], atol=1e-13)
 
 
 def test_a_linear_cell_learns_from_all_the_motion_before_where_windows_overlap():
     """Of two motions end to end, the second from rest again; of many frames and few windows, from the windows alone."""
     assembly, params, motion = ready(cell="linear")
-    once = assembly.network.codes(params, assembly.model, features_from_records(assembly.model, motion)).dynamic
+    network = assembly.network
+    once = codes_of(network, params, assembly.model, features_from_records(assembly.model, motion)).dynamic
     track, frames = features_from_records(assembly.model, motion, motion), len(once)
     ends = jnp.arange(2 * frames, dtype=jnp.int32)
-    found = assembly.network.windows(params, track, ends, 4, 3).dynamic
+    found = windows_to(network, params, track, ends, 4, 3).dynamic
     for begin in (0, frames):
         for back in range(3):
             after = found[2 - back, begin + back : begin + frames]
             np.testing.assert_allclose(after, once[: frames - back], rtol=0, atol=1e-13)
             assert not found[2 - back, begin : begin + back].any()  # before it began
-    few = assembly.network.windows(params, track, ends[frames - 1 : frames], 4, 1).dynamic
+    few = windows_to(network, params, track, ends[frames - 1 : frames], 4, 1).dynamic
     assert np.abs(few[0, 0] - once[-1]).max() > 1e-6
 
 
@@ -138,6 +143,7 @@ def test_pbns_traces_no_inertia(plain_jax):
 def test_training_and_coming_back(tmp_path, plain_jax, method):
     tables = load_scene(write_scene(tmp_path)).to_dict()
     tables["network"]["method"] = method
+    tables["physics"]["collision"]["search"], tables["motion"]["validation"] = "candidates", []  # what compiles fastest
     reports = []
     made = train(scene_from(tables, source=str(tmp_path / "scene.toml")), tmp_path / "run", steps=40, report=reports.append)
     assert sum(reports[-1].energies.values()) < sum(reports[0].energies.values())
