@@ -43,11 +43,15 @@ install_import_hook([f"ncs_jax.{name}" for name in ARRAYS], CHECKER)
 THOROUGH = bool(os.environ.get("NCS_THOROUGH"))
 
 # Files by what they cost, the dearest first, so that no worker begins a long one when the others are done.
-DEAREST = ["test_experiments", "test_notebook", "test_devices", "test_benchmarks", "test_training", "test_export", "test_runs"]
+DEAREST = """
+experiments notebook self_contact layers swing stiffness benchmarks devices runs properties collision training export evaluation
+methods cost fit own motion objective patch gltf elements cli energies io
+""".split()
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: DEAREST.index(item.path.stem) if item.path.stem in DEAREST else len(DEAREST))
+    order = {f"test_{name}": place for place, name in enumerate(DEAREST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -69,6 +69,8 @@ validate_every = 20
 checkpoint_every = 10
 """
 
+FREE = SCENE + "[physics.collision]\nstiffness = 0\n"  # the body is not touched: compiles in half the time
+
 
 def write_scene(folder, text=SCENE):
     """Write a whole scene into a folder; returns the scene file's path."""

@@ -17,7 +17,7 @@ from ncs_jax.network.methods.method import decode, for_inference
 from ncs_jax.simulation.solver.cholesky import elimination
 from ncs_jax.training.step import initial_state
 
-from .scenes import SCENE, write_scene
+from .scenes import FREE, SCENE, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def figures(benchmark, folder, *options):
 
 
 def test_start(tmp_path, capsys):
-    train(write_scene(tmp_path), tmp_path / "run", steps=10)
+    train(write_scene(tmp_path, FREE), tmp_path / "run", steps=10)
     assert start.main([str(tmp_path / "run"), "--repeats", "1", "--json", str(tmp_path / "x.json")]) == 0
     rows = json.loads((tmp_path / "x.json").read_text())
     assert list(rows) == ["import jax", "import ncs_jax", "load_run", "first frame", "all"]

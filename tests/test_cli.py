@@ -444,8 +444,8 @@ def test_a_damaged_checkpoint_is_refused(run_folder, tmp_path):
         truncated(path)
     done = process("evaluate", copy)
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith(f"ncs: {copy / 'checkpoints' / '10'}: the checkpoint cannot be read")
-    assert "ncs_jax" not in done.stderr, done.stderr
+    (line,) = done.stderr.splitlines()  # and nothing of the arrays that were still being read
+    assert line.startswith(f"ncs: {copy / 'checkpoints' / '10'}: the checkpoint cannot be read")
 
 
 def test_a_body_file_that_is_not_one(tmp_path, capsys):

@@ -27,7 +27,7 @@ from experiments import (
 )
 from ncs_jax import InputError, assemble
 
-from .scenes import SCENE, swing, write_scene
+from .scenes import FREE, SCENE, swing, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def _plain(plain_jax):
 
 
 def test_seeds(tmp_path, capsys):
-    scene, out = write_scene(tmp_path), tmp_path / "out"
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "out"
     assert seeds.main([str(scene), "--steps", "10", "--seeds", "2", "--out", str(out)]) == 0
     with (out / "seeds.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -61,7 +61,7 @@ def test_fit_material(tmp_path, capsys):
 
 def test_speed_accuracy(tmp_path, capsys):
     out = tmp_path / "out"
-    command = [str(write_scene(tmp_path)), "--quick", "--only", "fast", "--out", str(out)]
+    command = [str(write_scene(tmp_path, FREE)), "--quick", "--only", "fast", "--out", str(out)]
     assert speed_accuracy.main(command) == 0
     with (out / "speed_accuracy.csv").open() as file:
         rows = {row["point"]: row for row in csv.DictReader(file)}
@@ -117,7 +117,7 @@ def test_the_page_is_what_its_tables_say():
 
 
 def test_methods(alone, tmp_path):
-    rows = studied(methods, tmp_path)
+    rows = studied(methods, tmp_path, text=FREE)
     assert list(rows) == ["simulation", "pbns", "snug", "ncs"]
     assert float(rows["simulation"]["distance"]) == 0 and float(rows["simulation"]["dynamic_share"]) == 1
     assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")

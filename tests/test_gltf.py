@@ -21,7 +21,7 @@ from ncs_jax.scene.spec import scene_from
 from ncs_jax.view.live import view
 from tests import fbx_files
 from tests.characters import JOINTS, NAMES, figure, posed, rigid, skinned, write_glb
-from tests.scenes import SCENE
+from tests.scenes import FREE
 from tests.test_fbx import Hero
 
 
@@ -310,7 +310,7 @@ def test_a_scene_whose_body_and_motion_are_one_file(tmp_path, plain_jax, name):
     np.savez(tmp_path / "sleeve.npz", vertices=x, faces=faces, group_pins=np.flatnonzero(x[:, 1] > 0.59))
     scene = tmp_path / "scene.toml"
     motion = "hero.glb#walk" if name == "hero.glb" else name
-    scene.write_text(SCENE.replace("body.npz", name).replace("swing.npz", motion).replace("cloth.npz", "sleeve.npz"))
+    scene.write_text(FREE.replace("body.npz", name).replace("swing.npz", motion).replace("cloth.npz", "sleeve.npz"))
     assert main(["check", str(scene)]) == 0
     assert main(["train", str(scene), "--out", str(tmp_path / "run"), "--steps", "20"]) == 0
     assert main(["animate", str(tmp_path / "run"), "--motion", str(tmp_path / name), "--out", str(tmp_path / "out.npz")]) == 0

@@ -125,7 +125,7 @@ def test_it_is_simulated_over_the_garment_below(worn):
     scene = dataclasses.replace(
         worn.scene,
         physics=dataclasses.replace(worn.scene.physics, collision=collision),
-        motion=dataclasses.replace(worn.scene.motion, frames=(0, 8)),
+        motion=dataclasses.replace(worn.scene.motion, frames=(0, 4)),
     )
     found = simulate(scene, "swing.npz")
     assert found.status.max() == 0

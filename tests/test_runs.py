@@ -23,7 +23,7 @@ from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.devices import free_memory
 from ncs_jax.training.step import initial_state
 
-from .scenes import write_scene
+from .scenes import FREE, write_scene
 
 STEPS = 60
 SOURCE = Path(__file__).parents[1] / "src"
@@ -85,7 +85,7 @@ def killed_and_resumed(folder, scene, kills):
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
-    scene = write_scene(folder)
+    scene = write_scene(folder, FREE)
     out = folder / "run"
     start = time.monotonic()
     finish(command(scene, out))
@@ -122,7 +122,7 @@ def test_killed_at_ten_moments_and_resumed(unbroken, tmp_path, plain_jax):
 
 
 def test_a_run_is_not_overwritten(tmp_path, plain_jax):
-    scene, out = write_scene(tmp_path), tmp_path / "run"
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     train(scene, out, steps=10)
     with pytest.raises(InputError, match="--resume"):
         train(scene, out, steps=10)
@@ -140,7 +140,7 @@ def test_a_checkpoint_of_orbax_0_is_read_and_gone_on_with(tmp_path, plain_jax):
     """Runs of version 0.1 were written so: with the first of Orbax's two APIs, and its own folder of checkpoints."""
     import orbax.checkpoint as orbax_0
 
-    scene, out = write_scene(tmp_path), tmp_path / "run"
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     whole = train(scene, out, steps=20)
     folder = out / "checkpoints"
     assert sorted(p.name for p in folder.iterdir()) == ["10", "20"]
@@ -191,14 +191,14 @@ def test_reading_a_checkpoint_gives_pythons_hook_back(tmp_path, plain_jax, monke
 
 def test_killed_before_anything_was_prepared_a_run_goes_on(tmp_path, plain_jax):
     """Between its first two files: run.json is there, prepared.npz is not."""
-    scene, out = write_scene(tmp_path), tmp_path / "run"
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     write_run(out, {"steps": 0, "seed": 0, "scene": load_scene(scene).to_dict()})
     train(scene, out, steps=10, resume=True)
     assert load_run(out).steps == 10
 
 
 def test_minutes_choose_the_steps(tmp_path, plain_jax):
-    scene, seen = write_scene(tmp_path), []
+    scene, seen = write_scene(tmp_path, FREE), []
     began = time.monotonic()
     run = train(scene, tmp_path / "run", minutes=0.1, report=seen.append)
     assert seen[-1].step == seen[-1].steps == run.steps and run.steps % 10 == 0
@@ -207,7 +207,7 @@ def test_minutes_choose_the_steps(tmp_path, plain_jax):
 
 
 def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_path, plain_jax, monkeypatch):
-    scene, out = write_scene(tmp_path), tmp_path / "run"
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     monkeypatch.setattr("ncs_jax.training.devices.free_memory", lambda: 1000)
     with pytest.raises(InputError, match=r"training.batch: training does not fit into memory.*1e-06 GB are free"):
         train(scene, out, steps=10)
@@ -219,7 +219,7 @@ def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_pa
 
 def test_a_first_frame_takes_few_programs(tmp_path, plain_jax):
     """Each costs a process that starts some 10 ms, cached or not; array by array, loading would compile over fifty."""
-    train(write_scene(tmp_path), tmp_path / "run", steps=10)
+    train(write_scene(tmp_path, FREE), tmp_path / "run", steps=10)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
     jax.clear_caches()

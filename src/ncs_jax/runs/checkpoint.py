@@ -12,10 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import json
+import logging
 import os
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -162,13 +165,15 @@ class Checkpoints:
         ocp, folder = _orbax(), self._folder / str(self.latest())
         here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=here), like)
-        try:
-            with _alone(ocp), _quiet():
-                return ocp.load(folder, shapes, checkpointable_name=NAME)
-        except Exception as error:  # Orbax and its store have no common error class
-            reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
-            mend = "delete this folder to go back to the checkpoint before it"
-            raise InputError(f"the checkpoint cannot be read: {reason}", file=folder, mend=mend) from error
+        with _quiet():
+            try:
+                with _alone(ocp):
+                    return ocp.load(folder, shapes, checkpointable_name=NAME)
+            except Exception as error:  # Orbax and its store have no common error class
+                reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            _let_go()
+        mend = "delete this folder to go back to the checkpoint before it"
+        raise InputError(f"the checkpoint cannot be read: {reason}", file=folder, mend=mend)
 
     def _steps(self) -> list[int]:
         return sorted(int(p.name) for p in self._folder.iterdir() if p.name.isdigit())
@@ -204,7 +209,18 @@ def _alone(ocp):
 def _quiet():
     """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    log = logging.getLogger("asyncio")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
         sys.unraisablehook = hook
+        log.setLevel(level)
+
+
+def _let_go(seconds: float = 1.0) -> None:
+    """Wait until what else was being read has ended: what it says comes as it ends, and as it is collected."""
+    for _ in range(10):
+        gc.collect()
+        time.sleep(seconds / 10)
