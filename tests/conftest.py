@@ -43,7 +43,10 @@ install_import_hook([f"ncs_jax.{name}" for name in ARRAYS], CHECKER)
 THOROUGH = bool(os.environ.get("NCS_THOROUGH"))
 
 # Files by what they cost, the dearest first, so that no worker begins a long one when the others are done.
-DEAREST = ["experiments", "notebook", "self_contact", "layers", "swing", "stiffness", "benchmarks", "devices", "runs", "properties", "collision", "training", "export", "evaluation", "methods", "cost", "fit", "own", "motion", "objective", "patch", "gltf", "elements", "cli", "energies", "io"]
+DEAREST = [
+    *("experiments", "notebook", "self_contact", "layers", "swing", "stiffness", "benchmarks", "devices", "runs", "properties"),
+    *("collision", "training", "export", "evaluation", "methods", "cost", "fit", "own", "motion", "objective", "patch", "gltf"),
+]
 
 
 def pytest_collection_modifyitems(items):
