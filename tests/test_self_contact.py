@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache, partial
 
 import jax
@@ -73,7 +74,7 @@ def poses():
 every_pose = pytest.mark.parametrize("pose", poses())
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, Callable] = {
     "pairs": nearby_pairs,
     "through": intersecting,
     "slope": jax.value_and_grad(self_contact),
@@ -114,6 +115,14 @@ def distance(kind, corners):
     assert np.isfinite(weights).all() and weights.dtype == p.dtype
     np.testing.assert_allclose(weights.sum(axis=0), 0, atol=1e-6 if p.dtype == np.float32 else 1e-14)
     return np.linalg.norm(np.einsum("wp,wcp->cp", weights[1:], p[1:] - p[:1]), axis=0)
+
+
+def test_the_separation_of_many_pairs_in_single_precision():
+    """As NumPy finds it: compiled, and of more pairs than a small garment has."""
+    rng = np.random.default_rng(3)
+    p, weights = (rng.normal(size=shape).astype(np.float32) for shape in ((4, 3, 40_000), (4, 40_000)))
+    expected = np.einsum("wp,wcp->cp", weights[1:], p[1:] - p[:1])
+    np.testing.assert_allclose(jax.jit(separation)(p, weights), expected, atol=1e-5)
 
 
 def special():
