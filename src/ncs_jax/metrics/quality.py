@@ -218,18 +218,18 @@ def measure(
         x, previous, before = (jnp.asarray(positions[np.maximum(t - k, 0)]) for k in range(3))
         return _Frames(x, previous, before, track.matrices[t], track.matrices[np.maximum(t - 1, 0)])
 
-    def measured(program: Callable, first: int) -> dict[str, np.ndarray]:
-        return jax.device_get(program(block(first)))
+    def measured(first: int) -> dict[str, np.ndarray]:
+        rows: dict[str, np.ndarray] = {}
+        frames = block(first)
+        for program in programs:
+            rows |= jax.device_get(program(frames))
+        return rows
 
-    found = [measured(program, 0) for program in programs]  # compiles
-    tasks = [(program, first) for first in range(BLOCK, count, BLOCK) for program in programs]
+    first, *others = range(0, count, BLOCK)
+    blocks = [measured(first)]  # compiles
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps only one core busy
-        found += pool.map(measured, *zip(*tasks, strict=True)) if tasks else []
-    rows: dict[str, list] = {}
-    for part in found:
-        for name, values in part.items():
-            rows.setdefault(name, []).append(values)
-    return {name: np.concatenate(values)[:count] for name, values in rows.items()}
+        blocks += pool.map(measured, others)
+    return {name: np.concatenate([rows[name] for rows in blocks])[:count] for name in blocks[0]}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:
