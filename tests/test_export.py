@@ -294,7 +294,7 @@ def test_the_facts_say_what_a_host_has_to_know(tmp_path):
 @pytest.mark.parametrize(
     ("version", "until", "counted"),
     [
-        ("0.10.2", "2026-12-17", "six months, counted from the release of jax 0.10.2 on 2026-06-17"),
+        ("0.10.1", "2026-11-18", "six months, counted from the release of jax 0.10.1 on 2026-05-18"),
         ("0.13.0.dev20260831+ab1f", "2027-02-28", "the release of jax 0.13.0.dev20260831+ab1f on 2026-08-31"),
         ("0.99.0", "2028-02-29", "counted from today, 2027-08-31, as the release date of jax 0.99.0 is not known here"),
     ],

@@ -17,7 +17,7 @@ from ncs_jax.export.step import Step
 __all__ = ["PLATFORMS", "expiry", "load_stablehlo", "stablehlo_artifact"]
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")  # that an artifact is made for
-RELEASED = {"0.10.2": date(2026, 6, 17), "0.12.0.1": date(2026, 10, 20)}
+RELEASED = {"0.10.1": date(2026, 5, 18), "0.12.0.1": date(2026, 10, 20)}
 """When a JAX was released, for those that `constraints/` pins: the day its wheel was built. A nightly build names its day."""
 
 

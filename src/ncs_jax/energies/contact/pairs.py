@@ -117,9 +117,7 @@ def edge_weights(corners: Float[Array, "4 3 pairs"]) -> Float[Array, "4 pairs"]:
 
 def separation(corners: Float[Array, "4 3 pairs"], weights: Float[Array, "4 pairs"]) -> Float[Array, "3 pairs"]:
     """Return the way from the second primitive's closest point to the first's, sum_i w_i x_i in m; weights add up to zero."""
-    # Written out: as a sum over an axis jaxlib 0.10 compiles it wrongly for many pairs, see tests/test_jax.py.
-    first, second, third = (weights[i, None] * (corners[i] - corners[0]) for i in (1, 2, 3))
-    return first + second + third
+    return jnp.sum(weights[1:, None] * (corners[1:] - corners[:1]), axis=0)
 
 
 def _words(mask):
