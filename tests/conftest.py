@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 # faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
 HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 12  # from 0.12 on there is nothing else, and no such flag
 FAST = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+FAST += " --xla_cpu_parallel_codegen_split_count=1"  # the cores have work enough, and what is not split costs less
 FAST += " --xla_cpu_use_fusion_emitters=false" * HAS_EMITTERS
 GIVEN = os.environ.get("XLA_FLAGS", "").replace(FAST, "").strip()
 AS_USERS = {**os.environ, "XLA_FLAGS": GIVEN}  # the environment of a process that compiles as users do
@@ -24,6 +26,8 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
+
+gc.set_threshold(50_000, 20, 50)  # to trace makes so many objects that a tenth of the time went into looking for cycles
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 from pathlib import Path
@@ -32,6 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
     parsed = _parser().parse_args(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
     _keep_compiled_programs()
+    gc.freeze()  # to trace makes so many objects that a tenth of a start went into looking for cycles among them
+    gc.set_threshold(10_000, 20, 50)
     try:
         return parsed.run(parsed)
     except InputError as error:
