@@ -60,7 +60,10 @@ def _parser() -> argparse.ArgumentParser:
 def _keep_compiled_programs() -> None:
     """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR if that is set."""
     import jax
+    import jaxlib
 
+    if jaxlib.__version__ in ("0.10.0", "0.10.1"):  # which log two errors of no consequence for every program kept before
+        jaxlib.utils.absl_set_min_log_level(3)
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ncs-jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))
