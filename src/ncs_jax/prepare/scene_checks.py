@@ -109,21 +109,17 @@ def _mesh(a: Assembly) -> Iterator[Risk]:
 
 
 @jax.jit
-def _depths(model: Model, matrices):
-    """Return signed distances (frames, verts), m, to the body of the garment as the body alone carries it."""
-
-    def depth(matrices):
-        x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
-        index, _ = nearest_triangle(x, body, model.surface)
-        return triangle_distance(x, body, model.surface, index)
-
-    return jax.lax.map(depth, matrices)
+def _distances(model: Model, matrices):
+    """Return signed distances (verts,), m, to the body of the garment as the body alone carries it in one pose."""
+    x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
+    index, _ = nearest_triangle(x, body, model.surface)
+    return triangle_distance(x, body, model.surface, index)
 
 
 def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Risk]:
     """Yield a risk where, in some pose, a share `many` of the garment is more than `deep` (m) inside the body."""
     still = [MotionRecord(pose[None], np.zeros((1, 3), poses.dtype), model.fps) for pose in poses]
-    depth = -np.asarray(_depths(model, features_from_records(model, *still).matrices))
+    depth = -np.stack([_distances(model, features_from_records(model, one).matrices[0]) for one in still])
     share = float((depth > deep).mean(axis=1).max())
     if share > many:
         value = f"{100 * share:.1f} % of its vertices by more than {1000 * deep:.0f} mm, up to {1000 * depth.max():.1f} mm"
