@@ -10,8 +10,8 @@ from pathlib import Path
 # Nearly all of the time goes into compiling programs that then run for milliseconds: code that is compiled four times
 # faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
 HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 12  # from 0.12 on there is nothing else, and no such flag
-FAST = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-FAST += " --xla_cpu_parallel_codegen_split_count=1"  # the cores have work enough, and what is not split costs less
+PLAIN_CODE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"  # the programs are the same
+FAST = f"{PLAIN_CODE} --xla_cpu_parallel_codegen_split_count=1"  # the cores have work enough, and what is not split costs less
 FAST += " --xla_cpu_use_fusion_emitters=false" * HAS_EMITTERS
 GIVEN = os.environ.get("XLA_FLAGS", "").replace(FAST, "").strip()
 AS_USERS = {**os.environ, "XLA_FLAGS": GIVEN}  # the environment of a process that compiles as users do

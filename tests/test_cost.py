@@ -18,7 +18,7 @@ import pytest
 
 from benchmarks.cost import COUNTS, counted
 
-from .conftest import AS_USERS
+from .conftest import AS_USERS, PLAIN_CODE
 from .scenes import write_scene
 
 RECORD = Path(__file__).parent / "cost.json"
@@ -27,10 +27,11 @@ TOLERANCE = 0.03
 
 
 def measured(folder, *options):
-    """The counts of the scene of the tests, from a process of its own: JAX as a user has it, and a time limit."""
+    """The counts of the scene of the tests, from a process of its own: programs as a user has them, and a time limit."""
     out = folder / "cost.json"
     command = [sys.executable, "-m", "benchmarks.cost", str(write_scene(folder)), "--json", str(out), *options]
-    subprocess.run(command, check=True, timeout=300, cwd=RECORD.parents[1], env=AS_USERS, stdout=subprocess.DEVNULL)
+    environment = {**AS_USERS, "XLA_FLAGS": f"{PLAIN_CODE} {AS_USERS['XLA_FLAGS']}"}
+    subprocess.run(command, check=True, timeout=300, cwd=RECORD.parents[1], env=environment, stdout=subprocess.DEVNULL)
     return json.loads(out.read_text())["rows"]
 
 
