@@ -15,6 +15,7 @@ import numpy as np
 
 from ncs_jax.energies.contact.distance import triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.io import MotionRecord
@@ -112,8 +113,8 @@ def _mesh(a: Assembly) -> Iterator[Risk]:
 def _distances(model: Model, matrices):
     """Return signed distances (verts,), m, to the body of the garment as the body alone carries it in one pose."""
     x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
-    index, _ = nearest_triangle(x, body, model.surface)
-    return triangle_distance(x, body, model.surface, index)
+    surface = required(model.surface, "model.surface")
+    return triangle_distance(x, body, surface, nearest_triangle(x, body, surface)[0])
 
 
 def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Risk]:
