@@ -108,7 +108,7 @@ def test_the_readme_is_one_page_of_plain_words():
 
 
 @pytest.mark.slow
-def test_the_pages_can_be_followed():
+def test_the_pages_can_be_followed(plain_jax):
     from tools.follow_docs import follow
 
     assert not follow(pages())
