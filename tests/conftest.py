@@ -10,7 +10,7 @@ from pathlib import Path
 # Nearly all of the time goes into compiling programs that then run for milliseconds: code that is compiled four times
 # faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
 HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 12  # from 0.12 on there is nothing else, and no such flag
-PLAIN_CODE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"  # the programs are the same
+PLAIN_CODE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"  # XLA counts the same
 FAST = f"{PLAIN_CODE} --xla_cpu_parallel_codegen_split_count=1"  # the cores have work enough, and what is not split costs less
 FAST += " --xla_cpu_use_fusion_emitters=false" * HAS_EMITTERS
 GIVEN = os.environ.get("XLA_FLAGS", "").replace(FAST, "").strip()
@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
-gc.set_threshold(50_000, 20, 50)  # to trace makes so many objects that a tenth of the time went into looking for cycles
+gc.set_threshold(50_000, 20, 50)  # tracing makes many objects, and to look for cycles took a tenth of the time
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -33,8 +33,9 @@ def main(arguments: list[str] | None = None) -> int:
     parsed = _parser().parse_args(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
     _keep_compiled_programs()
-    gc.freeze()  # to trace makes so many objects that a tenth of a start went into looking for cycles among them
-    gc.set_threshold(10_000, 20, 50)
+    if arguments is None:  # the process is ours: tracing makes many objects, and to look for cycles took a tenth of a start
+        gc.freeze()
+        gc.set_threshold(10_000, 20, 50)
     try:
         return parsed.run(parsed)
     except InputError as error:
