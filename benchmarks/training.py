@@ -46,10 +46,13 @@ DEPTH = {"step": 0, "descriptors": 0, "network": 1, "physics": 1, "optimiser": 1
 
 
 def ready(scene: Scene) -> Assembly:
-    """A scene as training takes it, with what its motions fix."""
+    """A scene as training takes it, with what its motions fix and what a fresh network tells them."""
     assembly = assemble(scene)
     give_back()  # as training does
-    return replace(assembly, training_features=with_bodies(assembly.model, assembly.track, assembly.scene.training.batch))
+    model, network, features = assembly.model, assembly.network, assembly.track
+    if network.refreshes:
+        features = jax.jit(network.refresh)(initial_state(model, network, 0).params, model, features)
+    return replace(assembly, training_features=with_bodies(model, features, scene.training.batch))
 
 
 def steps(assembly: Assembly, count: int) -> tuple[Callable, list]:
@@ -99,8 +102,9 @@ def _energy(model: Model, name: str) -> Callable:
 
 def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple]:
     """Every part that the scene has, by name: a function, what it depends on, and its constants."""
-    model, network, whole, spec = assembly.model, assembly.network, assembly.track, assembly.scene.training
-    terms, params = model.terms, state.params
+    network, whole, spec, params = assembly.network, assembly.track, assembly.scene.training, state.params
+    terms = network.loss(assembly.model.terms)  # a swing's inertia is no term of a sample
+    model = replace(assembly.model, terms=terms)
     windows = functools.partial(windows_of, Task(model, network, spec))  # within a trace
     offsets = jax.jit(lambda p: gradients(model, network, p, whole, windows(ends, pairs)))(params)[2][1]
     history = len(offsets)

@@ -33,7 +33,8 @@ def weights(blend: Blend | None) -> float:
 def training(assembly: Assembly, params, ends: np.ndarray) -> dict[str, Work]:
     """Of each part of a training step by name, of one with windows that end at `ends`."""
     model, track, length = assembly.model, assembly.track, assembly.scene.training.window
-    batch, history, joints = len(ends), 3 if model.terms.inertia else 1, len(model.inputs)
+    inertia = assembly.network.loss(model.terms).inertia
+    batch, history, joints = len(ends), 3 if inertia else 1, len(model.inputs)
     item = model.garment.mesh.rest.dtype.itemsize
     verts, modes = model.basis.shape
     positions = 3.0 * verts * batch

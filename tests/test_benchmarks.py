@@ -62,6 +62,13 @@ def test_training(tmp_path, capsys):
     assert "no such folder" in capsys.readouterr().err
 
 
+def test_training_of_a_network_that_tells_the_motions_something(tmp_path):
+    text = FREE.replace("[network]", '[network]\ncell = "swing"').replace("[garment]", '[garment]\npins = "pins"')
+    assembly = training.ready(load_scene(write_scene(tmp_path, text)))
+    swing = assembly.track.swing
+    assert swing.shape == (len(assembly.track.start), assembly.network.modes) and np.isfinite(swing).all()
+
+
 def _fresh(folder, text=SCENE):
     assembly = assemble(load_scene(write_scene(folder, text)))
     ends = np.arange(min(4, len(assembly.track.start)), dtype=np.int32)
