@@ -19,7 +19,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,11 +104,11 @@ def points(scene: Scene, finer: str | None) -> list[Point]:
     return result
 
 
-def judged(point: Point, vertices: np.ndarray) -> dict[str, Any]:
-    """The vertices, and every quantity by the energies of the point's judge."""
+def judge_of(point: Point) -> Callable[[np.ndarray], dict[str, Any]]:
+    """What takes vertices and returns them and every quantity by the energies of the point's judge."""
     assembly = assemble(point.judge)
     track = features_from_records(assembly.model, load_motion(assembly.scene, motion_of(point.scene), assembly.body))
-    return {"vertices": vertices, **summarise(measure(assembly.model, vertices, track))}
+    return lambda vertices: {"vertices": vertices, **summarise(measure(assembly.model, vertices, track))}
 
 
 def motion_of(scene: Scene) -> str:
@@ -123,7 +123,7 @@ def trained(point: Point, steps: int | None) -> list[dict]:
     taken, memory = (time.monotonic() - began) / 60, peak_memory() / 1e6
     name = motion_of(point.scene)
     rows = []
-    track = run.track(name)
+    track, judged = run.track(name), judge_of(point)
     variants: dict[str, dict] = {"": {}, **(SMALLER if point.name in PRESETS else {})}
     for label, options in variants.items():
         if options.get("rank", 0) > min(len(track.start), point.scene.network.decoder[-1]):
@@ -131,7 +131,7 @@ def trained(point: Point, steps: int | None) -> list[dict]:
         small = run.compressed(name, **options) if options else run
         x = small.animate(track)
         row = {"point": f"{point.name}, {label}" if label else point.name, "minutes": taken, "memory": memory}
-        row |= judged(point, x)
+        row |= judged(x)
         row["frame"] = 1e3 * streamed(small, name)
         row["rate"] = len(x) / median(lambda small=small, track=track: small.animate(track))
         rows.append(row)
@@ -143,7 +143,7 @@ def simulated(point: Point) -> list[dict]:
     name = motion_of(point.scene)
     result = simulate(point.scene, name)
     row = {"point": point.name, "frame": 1e3 * float(np.median(result.seconds[1:])), "memory": peak_memory() / 1e6}
-    return [row | judged(point, result.vertices)]
+    return [row | judge_of(point)(result.vertices)]
 
 
 def median(call, repeats: int = 7) -> float:
