@@ -36,7 +36,7 @@ from ncs_jax.scene.features import motion_features
 from ncs_jax.scene.model import Model, pose_body, pose_garment
 from ncs_jax.scene.spec import Scene
 from ncs_jax.training.batches import CHUNK, batches
-from ncs_jax.training.devices import give_back
+from ncs_jax.training.devices import trim_memory
 from ncs_jax.training.loss import gradients, physics, with_bodies
 from ncs_jax.training.step import Task, TrainState, chunk_runner, initial_state, windows_of
 
@@ -48,7 +48,7 @@ DEPTH = {"step": 0, "descriptors": 0, "network": 1, "physics": 1, "optimiser": 1
 def ready(scene: Scene) -> Assembly:
     """A scene as training takes it, with what its motions fix and what a fresh network tells them."""
     assembly = assemble(scene)
-    give_back()  # as training does
+    trim_memory()  # as training does
     model, network, features = assembly.model, assembly.network, assembly.track
     if network.refreshes:
         features = jax.jit(network.refresh)(initial_state(model, network, 0).params, model, features)

@@ -32,7 +32,7 @@ EIGHT = """
 import dataclasses, json, sys
 import jax, jax.numpy as jnp, numpy as np
 from ncs_jax.runs.run import assemble
-from ncs_jax.training.devices import batch_mesh, copied, divided, local
+from ncs_jax.training.devices import batch_mesh, local, replicate, shard_batch
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.batches import batches
 from ncs_jax.training.step import chunk_runner, initial_state
@@ -46,9 +46,9 @@ pairs = np.stack([np.random.default_rng(s).permutation(spec.batch) for s in rang
 broken = dataclasses.replace(track, matrices=track.matrices.at[frames - 1].set(jnp.nan))
 seen = []
 for mesh in (None, batch_mesh(spec.batch)):
-    run, state = chunk_runner(network, spec, mesh), copied(mesh, initial_state(model, network, 0))
+    run, state = chunk_runner(network, spec, mesh), replicate(mesh, initial_state(model, network, 0))
     for motion in (track, broken):
-        state, logs = run(state, *divided(mesh, (ends, pairs)), 100, *copied(mesh, (model, motion)))
+        state, logs = run(state, *shard_batch(mesh, (ends, pairs)), 100, *replicate(mesh, (model, motion)))
         seen.append(jax.tree.map(np.asarray, (state, logs)))
         for leaf in jax.tree.leaves(state):
             assert leaf.is_fully_replicated

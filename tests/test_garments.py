@@ -13,8 +13,7 @@ from ncs_jax.cli import main
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import upright
 from ncs_jax.io.mesh.polygons import triangulate
-from ncs_jax.io.mesh.surface import summarise_surface
-from ncs_jax.prepare.garment_checks import check_on_body
+from ncs_jax.prepare.garment_checks import check_on_body, summarise_surface
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube
@@ -347,12 +346,24 @@ def test_a_garment_across_the_body_is_refused_unless_the_scene_says_so():
         check_on_body(Path("g.npz"), garment(upright(x, 1.0, "z"), up="z"), body, axis_given=False)
 
 
+def test_a_garment_of_the_right_but_unusual_unit_that_lies_down_is_told_its_axis():
+    x = grid()[0] @ np.array(TURNED["z"])
+    with pytest.raises(InputError, match=r'it looks like Z up: write up = "z" below'):
+        check_on_body(Path("g.npz"), garment(x, scale=0.1), post()["vertices"], axis_given=False)
+
+
 def test_a_garment_that_nothing_brings_onto_the_body():
     body = post()["vertices"]
     with pytest.raises(InputError, match=r"2\.41 m apart.*move it into the body's coordinates"):
         check_on_body(Path("g.npz"), garment(grid(origin=(2.5, 0.3, 0.0))[0] + [0.09, 0, 0]), body, axis_given=False)
     with pytest.raises(InputError, match=r"about the size of the body .*2\.5e\+04 m.*garment\.scale"):
         check_on_body(Path("g.npz"), garment(grid()[0] * 1e5), body, axis_given=False)
+
+
+def test_only_npz_is_written(tmp_path):
+    with pytest.raises(InputError, match=r"shirt\.obj: a file name that ends in \.npz expected"):
+        io.write_garment(tmp_path / "shirt.obj", garment(grid()[0]))
+    assert not list(tmp_path.iterdir())
 
 
 def test_check_says_what_a_garment_is_made_of(tmp_path, capsys):

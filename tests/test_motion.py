@@ -18,6 +18,7 @@ from ncs_jax.metrics.quality import measure
 from ncs_jax.network.methods.method import initial_parameters
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.motion_import import mirror_partners
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.features import input_joints, mirror, motion_features
 from ncs_jax.scene.spec import load_scene
@@ -89,6 +90,44 @@ def test_the_mirrored_character_wears_its_skin_mirrored(rng):
 
     image = skinned(there, x * [-1, 1, 1], weights[:, PARTNER])
     np.testing.assert_allclose(image, skinned(here, x, weights) * [-1, 1, 1], atol=1e-12)
+
+
+def test_a_pose_in_axes_of_its_joint_is_mirrored_in_the_world(rng):
+    """A glTF or FBX body writes each joint's turn in the joint's own axes at rest, Q: the world's pose a is Q^T a there."""
+    poses, translation = recorded(rng)
+    axes = Rotation.random(poses.shape[1], random_state=rng).as_matrix()
+
+    def own(world):
+        return np.einsum("jba,tjb->tja", axes, world)
+
+    found = mirror(own(poses), translation, PARTNER, axes=axes)
+    expected = mirror(poses, translation, PARTNER)
+    np.testing.assert_allclose(found[0], own(expected[0]), atol=1e-14)
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert np.abs(mirror(own(poses), translation, PARTNER)[0] - found[0]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        *(("thigh_l", "thigh_r"), ("UpLeg.L", "UpLeg.R"), ("Bip01 L Thigh", "Bip01 R Thigh"), ("lHip", "rHip")),
+        *(
+            ("mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"),
+            ("left_hip", "right_hip"),
+            ("L_Hip", "R_Hip"),
+            ("lThumb1", "rThumb1"),
+        ),
+    ],
+)
+def test_sides_are_told_by_the_names_of_many_tools(left, right):
+    joints = np.array([[0, 1, 0], [0.1, 0.9, 0], [0.5, 0.9, 0]])  # by place neither has a partner
+    np.testing.assert_array_equal(mirror_partners(("Hips", left, right), joints), [0, 2, 1])
+
+
+def test_sides_without_names_are_told_by_places():
+    joints = np.array([[0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0]])
+    for names in ((), ("Bone", "Bone.001", "Bone.002")):
+        np.testing.assert_array_equal(mirror_partners(names, joints), [0, 2, 1])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -14,6 +14,10 @@ import pytest
 
 import ncs_jax
 from ncs_jax import InputError
+from ncs_jax.cli import main
+from ncs_jax.energies.terms import MEASURED, NAMES, Terms
+from ncs_jax.metrics.motion import MEASURES
+from ncs_jax.metrics.quality import QUANTITIES
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.training.step import chunk_runner, initial_state
 
@@ -62,9 +66,22 @@ def trained(folder):
         return ncs_jax.train(scene(folder), folder / "run", steps=20, terms=[push, hook])
 
 
+@pytest.mark.parametrize("name", ["membrane", "total", "strain", "speed", "out_of_balance", "push", "no name"])
+def test_a_term_is_refused_whose_name_is_taken(name):
+    def mine(x, step):
+        return jnp.sum(x)
+
+    mine.__name__ = name
+    with pytest.raises(ValueError, match=f"no other term or measure has, not '{name}'"):
+        Terms(own=(push, mine))
+
+
 def test_terms_are_logged_and_measured_by_their_names(folder, trained, plain_jax):
     with (folder / "run" / "log.csv").open() as file:
-        assert {"push", "hook"} <= set(file.readline().split(","))
+        logged = set(file.readline().strip().split(","))
+    assert {"push", "hook"} <= logged
+    told = {name.removeprefix("validation_") for name in logged} - {"push", "hook", *NAMES}
+    assert told | {*QUANTITIES, *MEASURES} == set(MEASURED)  # none of which a term may be called
     motion = str(folder / "swing.npz")
     x, found = trained.animate(motion), trained.evaluate(motion)
     np.testing.assert_allclose(found["push"], -PUSH * x[:, :, 0].mean(axis=1), rtol=1e-4, atol=1e-6)
@@ -72,11 +89,13 @@ def test_terms_are_logged_and_measured_by_their_names(folder, trained, plain_jax
     np.testing.assert_allclose(found["total"], sum(parts), rtol=1e-5)
 
 
-def test_a_run_asks_for_its_terms(folder, trained, plain_jax):
+def test_a_run_asks_for_its_terms(folder, trained, plain_jax, capsys):
     motion = str(folder / "swing.npz")
     np.testing.assert_array_equal(ncs_jax.load_run(folder / "run").animate(motion), trained.animate(motion))
     with pytest.raises(InputError, match="own terms are needed"):
         ncs_jax.load_run(folder / "run").evaluate(motion)
+    assert main(["evaluate", str(folder / "run"), "--motion", motion]) == 2
+    assert "own terms are needed" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"push.*hook"):
         ncs_jax.load_run(folder / "run", terms=[push])
     with pytest.raises(InputError, match=r"push.*hook"):

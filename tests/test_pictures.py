@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ncs_jax.energies.terms import MEASURED, NAMES
 from ncs_jax.errors import InputError
 from ncs_jax.view import curves, pictures
 from ncs_jax.view.animation import Animation, PosedBody, upright
@@ -295,6 +296,15 @@ def test_energy_curves(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     with pytest.raises(InputError, match="rows"):
         curves.energy_curves(tmp_path / "c.png", [{"step": "1", "other": "2"}])
+
+
+def test_every_energy_that_a_log_holds_is_drawn(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    names, drawn = [*NAMES, "wind", *MEASURED, "validation_total"], []
+    monkeypatch.setattr(curves, "_curve", lambda axes, column, colour, label: drawn.append(label))
+    curves.energy_curves(tmp_path / "a.png", [{"step": i, **dict.fromkeys(names, 1.0 + i)} for i in range(3)])
+    terms = {name.replace("_", " ") for name in NAMES if name != "total"}
+    assert set(drawn) == terms | {"wind", "training", "mean strain", "penetrating vertices"} and len(drawn) == len(set(drawn))
 
 
 def test_matplotlib_stays_out_until_it_is_asked_for():

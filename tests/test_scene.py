@@ -47,6 +47,8 @@ def test_a_preset_takes_the_place_of_the_scenes_own_values(tmp_path):
     assert load_scene(write(tmp_path, ""), "balanced").to_dict() == Scene().to_dict()
     with pytest.raises(InputError, match="a table expected"):
         load_scene(write(tmp_path, "network = 3"), "fast")
+    with pytest.raises(InputError, match=r"preset: one of fast, balanced, accurate expected .found 'quick'"):
+        load_scene(path, "quick")
     costs = [sum(PRESETS[name]["network"]["decoder"]) * PRESETS[name]["training"]["steps"] for name in PRESETS]
     assert list(PRESETS) == ["fast", "balanced", "accurate"] and costs == sorted(set(costs))
 

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear, nnls
 
 from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.pairs import corners_of, edge_weights, groups_from, nearby_pairs, point_weights, separation
-from ncs_jax.energies.contact.safe_steps import free_share, swept_share, yielding
+from ncs_jax.energies.contact.safe_steps import free_share, limit_approach, swept_share
 from ncs_jax.energies.contact.self_contact import barrier, blocks, energy, gradient, product, repulsion, self_contact
 from ncs_jax.geometry.mesh import mesh_from
 
@@ -82,7 +82,7 @@ FUNCTIONS: dict[str, Callable] = {
     "repulsion": repulsion,
     "free": free_share,
     "swept": swept_share,
-    "yielding": yielding,
+    "limit_approach": limit_approach,
     "point": point_weights,
     "edge": edge_weights,
 }
@@ -447,11 +447,11 @@ def test_only_cloth_that_would_collide_gives_way():
     pairs = near(x, mesh, groups, 0.004)
     corner = np.exp(-np.sum((x[UPPER, :2] - x[UPPER][0, :2]) ** 2, axis=1) / 0.02**2)
     p = np.tile([0.3, -0.2, 0.1], (len(x), 1))
-    np.testing.assert_allclose(compiled["yielding"](x, p, pairs), p, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(compiled["limit_approach"](x, p, pairs), p, rtol=0, atol=1e-15)
     p[UPPER, 2] -= 0.02 * corner
     free = compiled["free"]
     assert free(x, p, pairs, 1.0) < 0.15 and through(x + p, mesh, groups).any()
-    way = np.asarray(compiled["yielding"](x, p, pairs))
+    way = np.asarray(compiled["limit_approach"](x, p, pairs))
     assert free(x, way, pairs, 1.0) > 0.9 and not through(x + way, mesh, groups).any()
     far = np.flatnonzero(UPPER)[corner < 1e-3]
     assert len(far) > 20

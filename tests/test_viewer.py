@@ -225,7 +225,7 @@ def test_one_page_has_one_body_and_one_garment(tmp_path, scene, name):
     body = PosedBody(scene["body"], scene["body_faces"])
     one = Animation(scene["animations"]["0"], scene["garment_faces"], 30.0, body)
     write_page(tmp_path / "a.html", {"0": one, "1": replace(one, body=PosedBody(body.vertices.copy(), body.faces))})
-    with pytest.raises(InputError, match="as animations") as caught:
+    with pytest.raises(InputError, match=r"of animations\['0'\] expected; ") as caught:
         write_page(tmp_path / "b.html", {"0": one, "1": DIFFERENT[name](one)})
     assert caught.value.field == "animations['1']" and not (tmp_path / "b.html").exists()
 

@@ -20,7 +20,8 @@ def add_commands(commands) -> None:
 
 def check(options) -> int:
     """Print what is in a scene, and what is at risk."""
-    from ncs_jax.io.mesh.surface import summarise_surface
+    from ncs_jax.energies.terms import NAMES
+    from ncs_jax.prepare.garment_checks import summarise_surface
     from ncs_jax.prepare.scene_checks import find_risks
     from ncs_jax.runs.run import assemble
     from ncs_jax.scene.spec import template
@@ -35,7 +36,7 @@ def check(options) -> int:
     names = assembly.body.joint_names if assembly.body is not None else ()
     joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
     terms = model.terms
-    on = [n for n in ("membrane", "bending", "collision", "gravity", "inertia", "pinning") if getattr(terms, n)]
+    on = [name for name in NAMES if getattr(terms, name, None)] + [term.__name__ for term in terms.own]
     print(f"{options.scene}: good")
     mass = float((mesh.vertex_area * model.material.density).sum())
     size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
@@ -51,6 +52,8 @@ def check(options) -> int:
     for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
         print(f"  over      {name}: {len(layer.rest)} vertices")
     print(f"  joints    {', '.join(joints)}")
+    if len(model.garment.pins):
+        print(f"  pins      {len(model.garment.pins)} vertices of the group {assembly.scene.garment.pins}")
     print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
     scene = assembly.scene
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):

@@ -50,6 +50,7 @@ def evaluate(options) -> int:
 
     if target.is_dir() and not options.scene:
         run = load_run(target)
+        run.check_terms()
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
         if options.reference is not None and len(names) > 1:
             raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")

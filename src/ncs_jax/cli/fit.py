@@ -37,9 +37,10 @@ def add_commands(commands) -> None:
 
 def fit(options) -> int:
     """Fit a garment to a body, write it with a picture, and print what was done to it."""
-    from ncs_jax.io.mesh.surface import boundary_loops, summarise_surface
+    from ncs_jax.io.mesh.surface import boundary_loops
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.fit import fit as fitted
+    from ncs_jax.prepare.garment_checks import summarise_surface
     from ncs_jax.view.animation import Animation, PosedBody
     from ncs_jax.view.pictures import contact_sheet
 

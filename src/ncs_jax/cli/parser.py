@@ -28,6 +28,14 @@ Neural cloth simulation: a garment learns to move on an animated character from 
 """
 
 
+# What an interrupted command has kept.
+GOES_ON = {
+    train.train: "; `ncs train --resume` goes on from the last checkpoint",
+    train.demo: "; `ncs demo` goes on from the last checkpoint",
+    simulate.simulate: "; the same command goes on with the frames that are done",
+}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command, and return its exit code: 0, 2 for input that cannot be used, or 130 when interrupted."""
     parsed = _parser().parse_args(arguments)
@@ -42,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"ncs: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
-        print("ncs: interrupted; `ncs train --resume` goes on from the last checkpoint", file=sys.stderr)
+        print(f"ncs: interrupted{GOES_ON.get(parsed.run, '')}", file=sys.stderr)
         code = 130
     if getattr(parsed, "hosts", None) is not None:
         train.leave(code)

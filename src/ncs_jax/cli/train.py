@@ -76,8 +76,9 @@ def demo(options) -> int:
         run = runs_train.train(options.scene, out, minutes=options.minutes, resume=resume, report=bar.show)
     quantities = _previews(run, out)
     motion = run.assembly.scene.motion.validation
-    print(f"On {motion[0] if motion else 'its own motion'}, which it never trained on:" if motion else "On its motion:")
-    print(f"  mean strain {quantities['strain_mean']:.2f} %, penetrating vertices {quantities['penetrating']:.2f} %")
+    print(f"On {motion[0]}, which it never trained on:" if motion else "On its motion:")
+    inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
+    print(f"  mean strain {quantities['strain_mean']:.2f} %{inside}")
     return 0
 
 

@@ -1,11 +1,13 @@
-"""Inertia, equation (13)."""
+"""Inertia, equation (13), and the acceleration that forces out of balance give."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["inertia", "project"]
+__all__ = ["G", "imbalance", "inertia", "out_of_balance", "project"]
+
+G = 9.81  # m/s^2, the unit of what is out of balance
 
 
 def project(
@@ -22,7 +24,7 @@ def inertia(
 
         E = 1 / (2 dt^2) sum_v m |x_t - x_proj|^2
 
-    The target is a plain argument: whoever trains decides whether it carries a gradient (`objective` stops it).
+    The target is a plain argument: whoever trains decides whether it carries a gradient (`total.energies` stops it).
 
     Args:
         x, target: (verts, 3, *poses) in m. mass: (verts,) in kg. dt: time step in s.
@@ -31,3 +33,14 @@ def inertia(
     """
     difference = (x - target) / dt
     return jnp.sum(mass.reshape(-1, *(1,) * (x.ndim - 1)) * difference * difference, axis=(0, 1)) / 2
+
+
+def imbalance(gradient: Float[Array, "verts 3"], mass: Float[Array, "verts"]) -> Float[Array, "verts"]:
+    """Return |dE/dx_v|^2 / m_v, N^2/kg: squared out-of-balance forces over mass; 0 where there is no mass."""
+    heavy = mass > 0
+    return jnp.where(heavy, jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1), 0)
+
+
+def out_of_balance(gradient: Float[Array, "verts 3"], mass: Float[Array, "verts"]) -> Float[Array, ""]:
+    """Return the mass-weighted r.m.s. of M^-1 dE/dx, in multiples of `G`: the residual of every solver here."""
+    return jnp.sqrt(jnp.sum(imbalance(gradient, mass)) / jnp.sum(mass)) / G

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ncs_jax.geometry.mesh import Mesh, corners, spread
 from ncs_jax.geometry.soa_vectors import Vector, minus, plus, times
 
-__all__ = ["columns", "deformation", "per_face"]
+__all__ = ["Columns", "columns", "deformation", "per_face"]
 
 Columns = Sequence[Vector]  # w_u and w_v
 

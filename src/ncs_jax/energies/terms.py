@@ -19,7 +19,7 @@ from ncs_jax.energies.neo_hookean import neo_hookean
 from ncs_jax.energies.stvk import stvk
 from ncs_jax.geometry.mesh import Mesh
 
-__all__ = ["DENSITIES", "MEMBRANES", "Garment", "Material", "OwnTerm", "StepInputs", "Terms"]
+__all__ = ["DENSITIES", "MEASURED", "MEMBRANES", "NAMES", "Garment", "Material", "OwnTerm", "StepInputs", "Terms"]
 
 
 MEMBRANES: dict[str, tuple[Callable[..., Array], tuple[str, ...]]] = {
@@ -47,6 +47,13 @@ NAMES = (
     "self_contact",
     "hold",
     "total",
+)
+# What a log and an evaluation write beside the energies: a term of this name would be lost among them.
+MEASURED = (
+    *("step", "strain", "moved", "dropped", "seconds"),
+    *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max", "middle_depth_max"),
+    *("self_intersecting", "out_of_balance", "speed", "lag", "settling", "overshoot", "gain", "dynamic_share"),
+    *("stopped_share", "hem_correlation", "distance"),
 )
 
 
@@ -85,11 +92,11 @@ class Terms:
         Raises:
             ValueError: it has not.
         """
-        taken = set(NAMES)
+        taken = {*NAMES, *MEASURED}
         for term in self.own:
             name = getattr(term, "__name__", "")
             if not name.isidentifier() or name in taken:
-                raise ValueError(f"a term of one's own needs a __name__ that no other term has, not {name!r}")
+                raise ValueError(f"a term of one's own needs a __name__ that no other term or measure has, not {name!r}")
             taken.add(name)
 
 

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import bending
 from ncs_jax.energies.contact.collision import collision
-from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
+from ncs_jax.energies.contact.distance import nearest_distance, plane_distance
 from ncs_jax.energies.contact.friction import friction
-from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
+from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.pairs import nearby_pairs
 from ncs_jax.energies.contact.self_contact import self_contact
 from ncs_jax.energies.contact.smooth import blended_contact, nearby_quadrics
@@ -38,8 +38,7 @@ def distances(
     `normals`: of the body's vertices, where they are known; "plane" works them out otherwise.
     """
     if terms.collision == "triangle":
-        index, _ = nearest_triangle(x, body, surface, exact=terms.exact)
-        return triangle_distance(x, body, surface, index)
+        return nearest_distance(x, body, surface, exact=terms.exact)
     if terms.collision == "smooth":
         return blended_contact(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
     index, _ = nearest_vertex(x, body, surface, exact=terms.exact)

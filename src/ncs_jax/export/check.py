@@ -26,7 +26,7 @@ THREADS = 2
 
 
 class Check(NamedTuple):
-    """Say how a written file does over a motion, beside the step that it was made from.
+    """The check of a written file: how it does over a motion, beside the step that it was made from.
 
     max_difference: the largest distance of a vertex, m. milliseconds: median of a frame on two threads. frames: how many.
     error: of the file from the garment as trained, mean and largest, mm, where the file has a smaller or a rounded network.

@@ -23,7 +23,7 @@ INTERFACE = 1  # of the step and the facts: a change that breaks a host gives th
 
 @dataclass(frozen=True)
 class FileFormat:
-    """Say how a step is written.
+    """The form in which a step is written.
 
     Attributes:
         name: one of `FORMATS`. float16: store the network's matrices in 16 bits; they are widened when loaded, and the

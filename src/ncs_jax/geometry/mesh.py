@@ -10,15 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ncs_jax.geometry.numerics import least_length
+from ncs_jax.geometry.degenerate import LINE, relative_heights
+from ncs_jax.geometry.numerics import least_length, norm
 from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, plus, times
 
 __all__ = [
-    "LINE",
     "Mesh",
     "Rings",
+    "adjacency",
     "corners",
     "dihedral",
+    "edge_strain",
     "material_axes",
     "mesh_from",
     "spread",
@@ -26,8 +28,6 @@ __all__ = [
     "vertex_rings",
     "with_middles",
 ]
-
-LINE = 2e-6  # rest height of a face, of its longest edge, up to which it is a line: float32 positions resolve no more
 
 
 @jax.tree_util.register_dataclass
@@ -54,7 +54,7 @@ class Rings:
 class Mesh:
     """A garment's rest state. Lengths in m, areas in m^2, angles in rad; elements of zero rest area weigh nothing.
 
-    A face has zero rest area if its height is at most `LINE` times its longest edge.
+    A face has zero rest area if its height is at most `degenerate.LINE` times its longest edge.
 
     A hinge is an edge between two faces: its vertices are the two ends, then the opposite vertex of each face.
     """
@@ -211,12 +211,11 @@ def mesh_from(
     p = x[faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     normal = np.cross(e1, e2)
+    good = relative_heights(x, faces) > LINE
     area = np.linalg.norm(normal, axis=1) / 2
     u = material_axes(x, faces, uv, warp)
     v = np.cross(normal / np.maximum(2 * area, 1e-300)[:, None], u)
     shape = np.stack([[np.sum(a * b, axis=1) for b in (e1, e2)] for a in (u, v)]).transpose(2, 0, 1)
-    longest = np.max([np.sum(e * e, axis=1) for e in (e1, e2, e2 - e1)], axis=0)
-    good = 2 * area > LINE * longest
     axes = np.linalg.inv(np.where(good[:, None, None], shape, np.eye(2))) * good[:, None, None]
     area = area * good
     vertex_area = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(x))
@@ -284,6 +283,20 @@ def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
     """Return the faces around each vertex (verts, most), padded with len(faces): a gather over them replaces a scatter."""
     places = _places(np.asarray(faces), verts)
     return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)
+
+
+def edge_strain(x: Float[Array, "verts 3"], mesh: Mesh) -> Float[Array, "edges"]:
+    """Return |l/l0 - 1| of every edge."""
+    lengths = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
+    return jnp.abs(lengths / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+
+
+def adjacency(edges: np.ndarray, verts: int):
+    """Return the sparse symmetric matrix (verts, verts) that is 1 where an edge of (edges, 2) joins two vertices."""
+    from scipy.sparse import coo_array
+
+    i, j = np.concatenate([edges, edges[:, ::-1]]).T
+    return coo_array((np.ones(len(i)), (i, j)), shape=(verts, verts)).tocsr()
 
 
 def with_middles(x, edges):

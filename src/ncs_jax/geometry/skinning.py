@@ -118,16 +118,16 @@ def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[
     return blended.reshape(-1, *matrices.shape[1:])
 
 
-def skin(blended: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *#poses"]) -> Float[Array, "verts 3 *poses"]:
+def skin(transforms: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *#poses"]) -> Float[Array, "verts 3 *poses"]:
     """Pose positions by linear blend skinning, from unposed ones, m."""
-    return sum((blended[:, :, i] * x[:, i, None] for i in range(3)), start=blended[:, :, 3])
+    return sum((transforms[:, :, i] * x[:, i, None] for i in range(3)), start=transforms[:, :, 3])
 
 
-def unpose(blended: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
+def unpose(transforms: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:
     """Return the inverse of `skin`, by the adjugate; zeros where it is singular: opposite rotations cancel in the blend."""
-    a, b, c = blended[..., 0], blended[..., 1], blended[..., 2]
+    a, b, c = transforms[..., 0], transforms[..., 1], transforms[..., 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
     determinant = jnp.sum(a * jnp.cross(b, c), axis=-1)
     singular = jnp.abs(determinant) < 1e-6
-    solution = jnp.sum(rows * (x - blended[..., 3])[:, None, :], axis=-1)
+    solution = jnp.sum(rows * (x - transforms[..., 3])[:, None, :], axis=-1)
     return jnp.where(singular[:, None], 0, solution / jnp.where(singular, 1, determinant)[:, None])

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ncs_jax.geometry.numerics import least_length
 
-__all__ = ["cross", "direction", "dot", "length", "minus", "plus", "times"]
+__all__ = ["Vector", "cross", "direction", "dot", "length", "minus", "plus", "times"]
 
 Vector = Sequence[Array] | Array  # three components: arrays of any one shape, or one array with them first
 

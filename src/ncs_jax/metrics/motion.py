@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ncs_jax.geometry.skinning import blend, skin, unpose
+from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model
+from ncs_jax.scene.model import Model, pose_rest
 
-__all__ = ["MEASURES", "compare_motion", "hem", "measure_motion", "stops", "unposed"]
+__all__ = ["MEASURES", "carried", "compare_motion", "hem", "measure_motion", "stops", "unposed"]
 
 # name: unit and what it is
 MEASURES = {
@@ -45,8 +45,9 @@ def unposed(model: Model, vertices, track: MotionFeatures) -> Float[np.ndarray, 
 
 
 @jax.jit
-def _carried(model: Model, matrices) -> Float[Array, "frames verts 3"]:
-    return jax.lax.map(lambda m: skin(blend(m, model.blend), model.garment.mesh.rest), matrices)
+def carried(model: Model, matrices: Float[Array, "frames joints 3 4"]) -> Float[Array, "frames verts 3"]:
+    """Return the garment in many frames as the body alone carries it, m."""
+    return jax.lax.map(lambda m: pose_rest(model, m), matrices)
 
 
 def hem(model: Model) -> np.ndarray:
@@ -125,9 +126,9 @@ def measure_motion(model: Model, vertices, track: MotionFeatures) -> dict[str, f
     hem does not come to rest after any stop.
     """
     u, low, fps = unposed(model, vertices, track), hem(model), model.fps
-    carried = np.asarray(_carried(model, track.matrices), np.float64)[:, low].mean(axis=1)
+    under = np.asarray(carried(model, track.matrices), np.float64)[:, low].mean(axis=1)
     path = track.relative(vertices).astype(np.float64)[:, low].mean(axis=1)
-    found = {"speed": _speed(u, track, fps), "lag": _lag(path, carried, fps)}
+    found = {"speed": _speed(u, track, fps), "lag": _lag(path, under, fps)}
     after = [_after(u[first - 1 : last, low].astype(np.float64).mean(axis=1), fps) for first, last in stops(track, model)]
     if after:
         times = [time for time, _ in after if time is not None]

@@ -16,19 +16,19 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import angles
-from ncs_jax.energies.contact.distance import triangle_distance
+from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.intersections import intersecting
-from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.pairs import Groups, groups_from
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.gravity import gravity
+from ncs_jax.energies.inertia import out_of_balance
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import Terms
 from ncs_jax.energies.total import distances
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import Mesh, corners, with_middles
-from ncs_jax.geometry.numerics import angle_between, arctan2, norm
+from ncs_jax.geometry.mesh import Mesh, corners, edge_strain, with_middles
+from ncs_jax.geometry.numerics import angle_between, arctan2
 from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.geometry.soa_vectors import cross, dot, length
 from ncs_jax.scene.features import MotionFeatures
@@ -71,8 +71,7 @@ def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
     With garments worn below (`layered`) a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
     points inward. The deepest points are therefore asked a second time: only what it also encloses is inside.
     """
-    index, _ = nearest_triangle(x, body, surface)
-    depth = -triangle_distance(x, body, surface, index)
+    depth = -nearest_distance(x, body, surface)
     if not layered:
         return depth
     deepest, at = lax.top_k(depth, min(DEEPEST, len(depth)))
@@ -99,7 +98,7 @@ class _Frames(NamedTuple):
 def _shape(model: Model, x) -> dict[str, Float[Array, ""]]:
     """Strain, shear and folds of a garment."""
     mesh = model.garment.mesh
-    strain = jnp.abs(norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]]) / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
+    strain = edge_strain(x, mesh)
     warp, weft = (jnp.stack(w, axis=-1) for w in deformation(x, mesh))
     shear = jnp.abs(angle_between(warp, weft) - np.pi / 2)
     bend = angles(corners(x, mesh.hinges), mesh)
@@ -126,10 +125,7 @@ def _energies_and_shape(model: Model, frames: _Frames) -> dict[str, Float[Array,
         if terms.gravity:
             lifted = gravity(origin[None], jnp.sum(mass, keepdims=True), model.material.gravity)
             total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
-        heavy = mass > 0
-        square = jnp.sum(gradient * gradient, axis=-1) / jnp.where(heavy, mass, 1)
-        out_of_balance = jnp.sqrt(jnp.sum(jnp.where(heavy, square, 0)) / jnp.sum(mass)) / 9.81
-        return {"total": total, **parts, **_shape(model, frame.x), "out_of_balance": out_of_balance}
+        return {"total": total, **parts, **_shape(model, frame.x), "out_of_balance": out_of_balance(gradient, mass)}
 
     return lax.map(one, frames.seen_from_root())
 

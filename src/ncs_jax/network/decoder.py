@@ -44,7 +44,7 @@ class Outward(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "batch inside"]) -> Float[Array, "outside batch"]:
-        """One column for every row of x."""
+        """Return one column for every row of x."""
         kernel = self.param("kernel", self.kernel_init, (self.size, x.shape[-1]), self.dtype)
         bias = self.param("bias", nn.initializers.zeros, (self.size,), self.dtype)
         return outward(kernel, x) + bias[:, None]
@@ -54,9 +54,9 @@ class Decoder(nn.Module):
     """Vertex offsets in unposed space from a code: a perceptron and a linear map, (6) and (7).
 
     The linear map has two parts that add: one moves each vertex by itself, in units of `local` (m); the other moves the smooth
-    modes of the garment (see `modes`), so that drape and swing, soft and global, are learned as readily as strain, stiff and
-    local. Together they are one linear map, see `merge`. The units are such that an optimiser step of 1e-3 moves vertices by
-    about a millimetre, not by decimetres.
+    modes of the garment (see `laplacian_modes.modal_basis`), so that drape and swing, soft and global, are learned as readily
+    as strain, stiff and local. Together they are one linear map, see `merge`. The units are such that an optimiser step of 1e-3
+    moves vertices by about a millimetre, not by decimetres.
     """
 
     verts: int
@@ -85,7 +85,7 @@ class Decoder(nn.Module):
         return h
 
     def __call__(self, code: Float[Array, "*poses code"], basis: Float[Array, "verts modes"]) -> Float[Array, "verts 3 *poses"]:
-        """Offsets (verts, 3, *poses) in m to add to the rest garment."""
+        """Return offsets (verts, 3, *poses) in m to add to the rest garment."""
         h = self.features(code.reshape(-1, code.shape[-1]))
         if self.rank:
             h = self.reduced(h)

@@ -23,7 +23,7 @@ class StaticEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, descriptor: Float[Array, "*batch joints numbers"]) -> Float[Array, "*batch code"]:
-        """Code of `(..., joints, numbers)` descriptors; each frame by itself."""
+        """Return the code of `(..., joints, numbers)` descriptors; each frame by itself."""
         h = descriptor.reshape(*descriptor.shape[:-2], -1)
         for i, size in enumerate(self.sizes):
             layer = nn.Dense(size, param_dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name=f"layer_{i}")
@@ -145,7 +145,7 @@ class DynamicEncoder(nn.Module):
     def __call__(
         self, descriptors: Float[Array, "frames *batch joints numbers"], state: Float[Array, "*batch code"]
     ) -> Float[Array, "frames *batch code"]:
-        """Codes of a sequence, time leading, from a state."""
+        """Return the codes of a sequence, time leading, from a state."""
         features = self.features(descriptors)
         if self.is_initializing():
             return self.step(state, features[0])[None]
@@ -159,7 +159,7 @@ class DynamicEncoder(nn.Module):
 
 
 class LinearEncoder(DynamicEncoder):
-    """With a diagonal linear recurrence h_t = lambda h_{t-1} + sqrt(1 - |lambda|^2) f_t, complex, in place of the gated unit.
+    """A diagonal linear recurrence h_t = lambda h_{t-1} + sqrt(1 - |lambda|^2) f_t, complex, in place of the gated unit.
 
     |lambda| = exp(-exp(nu)) < 1 whatever is learned, so the state cannot grow: each number of it is a decaying oscillation,
     the real parts first. Source: Orvieto et al. 2023, with no skip or normalisation.
@@ -212,7 +212,7 @@ class SwingEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, swing: Float[Array, "*batch modes"]) -> Float[Array, "*batch code"]:
-        """Code of each swing by itself, at first next to nothing."""
+        """Return the code of each swing by itself, at first next to nothing."""
         h = swing
         dense = functools.partial(nn.Dense, use_bias=False, param_dtype=self.dtype)
         for i, size in enumerate(self.sizes):

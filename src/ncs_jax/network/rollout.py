@@ -115,8 +115,8 @@ def animate(
     """Return the vertices of the garment over one whole motion, m: z = z_S + alpha z_D (15), decoded and skinned (16).
 
     Args:
-        track: of one motion, from `motion.track`. alpha: motion control; `None` gives the static result and traces nothing
-            dynamic (alpha = 0 gives the same vertices).
+        track: of one motion, from `features.motion_features`. alpha: motion control; `None` gives the static result and traces
+            nothing dynamic (alpha = 0 gives the same vertices).
     """
     if model.under:
         track = replace(track, matrices=track.matrices[:, : len(model.skeleton.parents)])
@@ -129,7 +129,10 @@ _animate = jax.jit(animate, static_argnums=1)
 
 
 def animated(model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float = 1.0) -> np.ndarray:
-    """Return the same as NumPy, compiled for whole blocks of frames, so that motions of many lengths share the program."""
+    """Return what `animate` returns, as NumPy.
+
+    It is compiled for whole blocks of frames, so motions of many lengths share a program.
+    """
     frames = track.start.shape[0]
     padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % PADDED)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
     return np.asarray(_animate(model, network, params, padded, float(alpha)))[:frames]

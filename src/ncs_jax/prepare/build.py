@@ -46,7 +46,7 @@ class Assembly:
 
     @property
     def track(self) -> MotionFeatures:
-        """All training motions end to end.
+        """Return all training motions end to end.
 
         Raises:
             InputError: the scene is that of a loaded run, which is made ready without them.
@@ -172,9 +172,10 @@ def _training_features(files: SceneFiles, model: Model, motions: list[io.MotionR
         joints = 1 if body is None else len(body.parents)
         motions = [io.MotionRecord(np.zeros((1, joints, 3), np.float32), np.zeros((1, 3), np.float32), model.fps, ())]
     elif files.scene.motion.mirror and body is not None:
-        partner = mirror_partners(body.joint_names, body.joints)
-        mirrored = [io.MotionRecord(*mirror(r.poses, r.translation, partner), r.fps, r.joint_names) for r in motions]
-        motions = motions + mirrored
+        partner, axes = mirror_partners(body.joint_names, body.joints), body.rest_rotations
+        for r in motions[:]:
+            poses, translation = mirror(r.poses, r.translation, partner, axes=axes)
+            motions = [*motions, io.MotionRecord(poses, translation, r.fps, r.joint_names)]
     return features_from_records(model, *motions)
 
 

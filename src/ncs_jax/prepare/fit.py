@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import triangle_distance
-from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.mesh import topology, with_middles
+from ncs_jax.geometry.mesh import adjacency, topology, with_middles
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
@@ -174,10 +173,8 @@ def _best_place(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.nda
 
 @jax.jit
 def _distance(x, body, surface: Surface):
-    index, _ = nearest_triangle(x, body, surface)
-
     def total(x):
-        distance = triangle_distance(x, body, surface, index)
+        distance = nearest_distance(x, body, surface)
         return jnp.sum(distance), distance
 
     (_, distance), away = jax.value_and_grad(total, has_aux=True)(x)
@@ -196,11 +193,10 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
     Each round moves a vertex that is too near the body, or that ends an edge whose middle is, away from the body until it is
     not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth.
     """
-    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse import diags_array
 
     edges = topology(faces)[0]
-    i, j = np.concatenate([edges, edges[:, ::-1]]).T
-    around = coo_array((np.ones(len(i)), (i, j)), shape=(len(x), len(x))).tocsr()
+    around = adjacency(edges, len(x))
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
     surface = surface_from(with_middles(x, edges), body.vertices, body.faces)
     rest, held, own = x.astype(np.float64), np.zeros(len(x), bool), np.zeros(x.shape)
@@ -257,7 +253,7 @@ def spread_weights(garment: GarmentRecord, body: BodyRecord, surface: Surface) -
     follows the cloth that it hangs on, and is not torn to either side. Weights are 0 to 1 and sum to 1, because the inverse of
     the system's matrix is positive. Source: the matching of Abdrashitov et al. 2023, with a smooth c_v instead of a threshold.
     """
-    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
     x, edges = garment.vertices, topology(garment.faces)[0]
@@ -265,8 +261,7 @@ def spread_weights(garment: GarmentRecord, body: BodyRecord, surface: Surface) -
     distance, away = _distances(x, body, surface)
     facing = np.maximum(np.sum(vertex_normals(x, garment.faces) * away, axis=1), 0)
     trust = np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing + LEAST
-    i, j = np.concatenate([edges, edges[:, ::-1]]).T
-    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(x), len(x))).tocsr()
+    graph = adjacency(edges, len(x))
     stiff = (SMOOTH / np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).mean()) ** 2
     system = diags_array(trust) + stiff * (diags_array(graph.sum(axis=1)) - graph)
     weights = np.maximum(splu(system.tocsc()).solve(trust[:, None] * own), 0)

@@ -1,16 +1,19 @@
-"""Checks that a garment lies on the body; where it does not, they look for the unit and axis with which it would."""
+"""What a garment's mesh is made of, and whether it lies on the body: if not, the unit and axis with which it would."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
+from ncs_jax.geometry.degenerate import LINE, relative_heights
 from ncs_jax.io.mesh.axes import TURNS, upright
+from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["FAR", "UNITS", "check_on_body", "distance_outside"]
+__all__ = ["FAR", "UNITS", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
 
 UNITS = {
     0.01: "centimetres",
@@ -22,6 +25,26 @@ UNITS = {
 }  # metres a unit of a file, and its name
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
+
+
+@dataclass(frozen=True)
+class SurfaceSummary:
+    """Numbers of a surface: connected components, loops of the boundary (holes), triangles too slim to have a normal."""
+
+    components: int
+    loops: int
+    degenerate: int
+
+
+def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
+    """Count the components, holes and degenerate triangles of a surface that `check_surface` has passed."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    graph = coo_array((np.ones(len(half), bool), tuple(half.T)), shape=(len(x), len(x)))
+    components = int(connected_components(graph, directed=False)[0])
+    return SurfaceSummary(components, len(boundary_loops(faces)), int((relative_heights(x, faces) <= LINE).sum()))
 
 
 def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_given: bool) -> None:
@@ -66,8 +89,11 @@ def _mend(garment: GarmentRecord, body: np.ndarray) -> str:
         for scale in dict.fromkeys((garment.scale, *UNITS)):
             x = upright(raw, scale, up)
             if distance_outside(x, body) <= FAR and np.ptp(x, axis=0).max() >= FAR * np.ptp(body, axis=0).max():
-                words = [UNITS[scale]] * (scale != garment.scale) + [f"{up.upper()} up"] * (up != garment.up)
-                fields = [f"scale = {scale:g}"] * (scale != garment.scale) + [f'up = "{up}"'] * (up != garment.up)
+                words, fields = [], []
+                if scale != garment.scale:
+                    words, fields = [UNITS[scale]], [f"scale = {scale:g}"]
+                if up != garment.up:
+                    words, fields = [*words, f"{up.upper()} up"], [*fields, f'up = "{up}"']
                 return f"it looks like {', '.join(words)}: write {' and '.join(fields)} below [garment] in the scene file"
     return ""
 

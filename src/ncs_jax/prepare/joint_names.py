@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ncs_jax.io.character.hierarchy import path_to_root
 
-__all__ = ["Limbs", "anatomy", "pair"]
+__all__ = ["Limbs", "anatomy", "pair", "side_and_rest"]
 
 PREFIX = re.compile(
     r"^(mixamorig\d*[_\-. :]*|(j[_ ]?bip([_ ]c(?=[_ ]))?|bip\d+|def|org|valvebiped|cc[_ ]base|[mf][_ ]avg)[_\-. :]+)", re.I
@@ -61,7 +61,7 @@ def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
     Args:
         names: of the joints. parents: their parents, before them, -1 at the root.
     """
-    plain = [_plain(name) for name in names]
+    plain = [side_and_rest(name) for name in names]
     roles: dict[str, int] = {}
     for j, (side, word) in enumerate(plain):
         beside = {w for s, w in plain if s == side} if side else set()
@@ -113,7 +113,7 @@ def _spread(i: int, count: int, length: int, lone: int) -> int:
     return lone if count == 1 else round(i * (length - 1) / (count - 1))
 
 
-def _plain(name: str) -> tuple[str, str]:
+def side_and_rest(name: str) -> tuple[str, str]:
     """Return the side ("left", "right" or "") and the rest of a name, in small letters and without separators."""
     parts = [p.lower() for p in PART.findall(PREFIX.sub("", re.split(r"[:|]", name)[-1]))]
     parts = [str(int(p)) if p.isdigit() else p for p in parts]

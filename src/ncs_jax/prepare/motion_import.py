@@ -13,6 +13,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.joint_names import side_and_rest
 from ncs_jax.prepare.retarget import body_names, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.scene.spec import MotionSpec, Scene, packaged
 
@@ -164,18 +165,11 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
 
 
 def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
-    """Return each joint's partner on the other side: by names (left/right, L_/R_), else by mirrored rest places (x to -x)."""
-    if names:
-        lower = [n.lower() for n in names]
-        place = {n: i for i, n in enumerate(lower)}
-
-        def other(n):
-            for a, b in (("left", "right"), ("l_", "r_"), ("lthumb", "rthumb"), ("lhip", "rhip")):
-                for x, y in ((a, b), (b, a)):
-                    if n.startswith(x) or (len(x) > 2 and x in n):
-                        return n.replace(x, y, 1)
-            return n
-
-        return np.array([place.get(other(n), i) for i, n in enumerate(lower)])
+    """Return each joint's partner on the other side: by names of left and right, else by mirrored rest places (x to -x)."""
+    told = [side_and_rest(name) for name in names]
+    if any(side for side, _ in told):
+        place = {one: i for i, one in reversed(list(enumerate(told)))}  # the first of equal names
+        other = {"left": "right", "right": "left", "": ""}
+        return np.array([place.get((other[side], rest), i) for i, (side, rest) in enumerate(told)])
     mirrored = joints * [-1, 1, 1]
     return np.linalg.norm(joints[None] - mirrored[:, None], axis=-1).argmin(axis=1)

@@ -138,7 +138,7 @@ def retarget(
     still = tuple(n for n in names if n not in driven)
     unused = tuple(n for n in motion.joint_names if n not in set(driven.values()))
     result = Retargeted(MotionRecord(local, translation, motion.fps, names), driven, still, unused, scale)
-    notes = [*_notes(result, motion, legs, scaled_by, float(soles.max() - low))]
+    notes = [*_notes(result, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
         notes.append(f"motion.joints names joints that this motion does not have: {', '.join(absent)}")
     return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright))))
@@ -363,7 +363,7 @@ def _sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np
     return heights.min(axis=1) - (points @ up).min()
 
 
-def _notes(result: Retargeted, motion: MotionRecord, leg: float, scaled_by: str, rise: float) -> tuple[str, ...]:
+def _notes(result: Retargeted, leg: float, scaled_by: str, rise: float) -> tuple[str, ...]:
     """Describe what was done; `leg` is the length of the motion's legs in its own unit, `rise` in m."""
     count = len(result.pairs) + len(result.still)
     pairs = [o if o == t else f"{o} by {t}" for o, t in result.pairs.items()]

@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import triangle_distance
-from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.distance import nearest_distance
+from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import LINE
-from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.geometry.degenerate import LINE, relative_heights
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.build import Assembly, features_from_records
-from ncs_jax.scene.model import Model, local_rotations, pose_body
+from ncs_jax.scene.model import Model, local_rotations, pose_body, pose_rest
 from ncs_jax.scene.spec import Scene
 
 __all__ = ["RANGES", "Risk", "find_risks"]
@@ -75,10 +74,10 @@ def _material(scene: Scene) -> Iterator[Risk]:
     yield from _outside("density", physics.density, f"{physics.density:g} kg/m^2", rounding, "physics.density")
     pull = float(np.linalg.norm(physics.gravity))
     yield from _outside("gravity", pull, f"{pull:g} m/s^2", rounding, "physics.gravity")
-    names = {"stvk": ("lam", "mu"), "neo_hookean": ("lam", "mu"), "baraff_witkin": ("stretch", "shear"), "none": ()}
+    membrane = physics.membrane.model
     pairs = {
         f"physics.membrane.{n}": (getattr(physics.membrane, n), getattr(default.membrane, n))
-        for n in names.get(physics.membrane.model, ("stiffness",))
+        for n in (MEMBRANES[membrane][1] if membrane != "none" else ())
     }
     for term in ("bending", "collision", "pinning"):
         pairs[f"physics.{term}.stiffness"] = getattr(physics, term).stiffness, getattr(default, term).stiffness
@@ -92,10 +91,7 @@ def _mesh(a: Assembly) -> Iterator[Risk]:
     x, faces = np.asarray(a.garment.vertices, np.float64), np.asarray(a.garment.faces)
     size = float(np.ptp(x, axis=0).max())
     yield from _outside("size", size, f"{size:.3g} m", "thicknesses and stiffnesses are meant for metres", "scale it to metres")
-    edges = np.linalg.norm(x[faces] - x[np.roll(faces, 1, axis=1)], axis=-1)
-    double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=-1)
-    longest = edges.max(axis=1)
-    slim = double / np.where(longest > 0, longest, 1) ** 2
+    slim = relative_heights(x, faces)
     clean = "clean the mesh where it was made"
     flat = int((slim <= LINE).sum())
     if flat:
@@ -112,9 +108,7 @@ def _mesh(a: Assembly) -> Iterator[Risk]:
 @jax.jit
 def _distances(model: Model, matrices):
     """Return signed distances (verts,), m, to the body of the garment as the body alone carries it in one pose."""
-    x, body = skin(blend(matrices, model.blend), model.garment.mesh.rest), pose_body(model, matrices)
-    surface = required(model.surface, "model.surface")
-    return triangle_distance(x, body, surface, nearest_triangle(x, body, surface)[0])
+    return nearest_distance(pose_rest(model, matrices), pose_body(model, matrices), required(model.surface, "model.surface"))
 
 
 def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Risk]:

@@ -11,6 +11,7 @@ import numpy as np
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.geometry.closest_point import closest_weights
+from ncs_jax.geometry.mesh import adjacency
 from ncs_jax.io.character.hierarchy import path_to_root
 
 __all__ = ["smooth_weights", "transfer_weights", "used_joints"]
@@ -32,13 +33,11 @@ def _nearest(x, body, surface: Surface):
 
 def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.ndarray:
     """Replace each vertex's weights by the mean of its neighbours' weights, `times` times."""
-    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse import diags_array
 
-    verts = len(weights)
-    i, j = np.concatenate([edges, edges[:, ::-1]]).T
-    neighbours = coo_matrix((np.ones(len(i)), (i, j)), shape=(verts, verts)).tocsr()
+    neighbours = adjacency(edges, len(weights))
     degree = np.asarray(neighbours.sum(axis=1)).ravel()
-    mean = diags(1 / np.maximum(degree, 1)) @ neighbours + diags((degree == 0).astype(float))
+    mean = diags_array(1 / np.maximum(degree, 1)) @ neighbours + diags_array((degree == 0).astype(float))
     for _ in range(times):
         weights = mean @ weights
     return weights / weights.sum(axis=1, keepdims=True)

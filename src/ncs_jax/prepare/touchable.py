@@ -15,7 +15,7 @@ from ncs_jax.geometry.skinning import Blend, Skeleton, blend, blend_from, forwar
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Layer, Model, pose_body
+from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
 
 __all__ = ["covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
@@ -103,7 +103,7 @@ def surface_of(model: Model, faces, track: MotionFeatures | None, smooth: bool, 
 @jax.jit
 def _worn(model: Model, matrices) -> tuple[jax.Array, jax.Array]:
     """Return the rest garment, skinned, and the body in several frames, m."""
-    return jax.vmap(lambda m: (skin(blend(m, model.blend), model.garment.mesh.rest), pose_body(model, m)))(matrices)
+    return jax.vmap(lambda m: (pose_rest(model, m), pose_body(model, m)))(matrices)
 
 
 def touchable_part(scene, body, garment, weights, records) -> np.ndarray:

@@ -17,7 +17,7 @@ from ncs_jax.prepare.build import Assembly
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.training.batches import batches
-from ncs_jax.training.devices import batch_mesh, compiled, copied, divided, local
+from ncs_jax.training.devices import batch_mesh, compiled, local, replicate, shard_batch
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
 from ncs_jax.training.step import TrainState, chunk_runner, initial_state
@@ -41,7 +41,7 @@ class PlacedScene:
         self.mesh = batch_mesh(spec.batch)
         self._chunk = chunk_runner(network, spec, self.mesh)
         self._compiled: dict[int, Callable] = {}
-        self._everywhere = copied(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
+        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
 
     @property
     def devices(self) -> int:
@@ -54,7 +54,7 @@ class PlacedScene:
 
     def copied(self, tree):
         """Return the first process's arrays on every device."""
-        return copied(self.mesh, tree)
+        return replicate(self.mesh, tree)
 
     def local(self, tree):
         """Return this process's copy of arrays that every device has."""
@@ -84,7 +84,7 @@ class PlacedScene:
         return diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
 
     def refresh(self, params: dict) -> None:
-        """Tell the motions what the network tells them now, if it tells them anything: see `Method.refresh`."""
+        """Recompute what the network adds to the motions, such as the swing: see `Method.refresh`."""
         if self.assembly.network.refreshes:
             told = _told(self.assembly.network, params, self.model, self.assembly.track)
             model, features = self._everywhere
@@ -111,7 +111,7 @@ class PlacedScene:
         ends = self._ends(first, count)
         each = [np.random.default_rng([self.seed, 1, step]) for step in range(first, first + count)]
         pairs = np.stack([rng.permutation(ends.shape[1]) for rng in each]).astype(np.int32)
-        return (state, *divided(self.mesh, (ends, pairs)), steps, *self._everywhere)
+        return (state, *shard_batch(self.mesh, (ends, pairs)), steps, *self._everywhere)
 
     def _ready(self, arguments: tuple) -> Callable:
         """Return the program for a chunk's arguments, compiled once for every number of steps."""

@@ -28,7 +28,7 @@ from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene, scene_from
 from ncs_jax.training.step import initial_state
 
-__all__ = ["Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over"]
+__all__ = ["NetworkMaker", "Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over"]
 
 
 NetworkMaker = Callable[[Scene, Model], Method]  # makes a network of one's own, sized for a model
@@ -44,11 +44,19 @@ class Run:
     lacking: tuple[str, ...] = ()  # names of own terms that it was trained with and that were not given again
 
     def track(self, motion: str) -> MotionFeatures:
-        """Return a motion, ready to animate: a file, `ncs:NAME`, or one as the scene names it."""
+        """Return a motion, ready to animate: a file, `ncs:NAME`, or one as the scene names it.
+
+        Raises:
+            InputError: the motion cannot be read, is not in metres, or does not fit the body.
+        """
         return features_from_records(self.assembly.model, self.motion(motion))
 
     def motion(self, name: str) -> io.MotionRecord:
-        """Return a motion at the scene's frame rate; a path that the scene does not name is taken from the current folder."""
+        """Return a motion at the scene's frame rate; a path that the scene does not name is taken from the current folder.
+
+        Raises:
+            InputError: the motion cannot be read, is not in metres, or does not fit the body.
+        """
         a = self.assembly
         if name in a.motions:
             return a.motions[name]
@@ -117,12 +125,16 @@ class Run:
             trained=(self.assembly.network, self.params) if rank or float16 else None,
         )
 
-    def evaluate(self, motion: str | MotionFeatures, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
-        """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
+    def check_terms(self) -> None:
+        """Raise an InputError where the run was trained with terms that were not given again: its energies lack them."""
         if self.lacking:
             mend = "open it with ncs_jax.load_run(folder, terms=[...])"
             what = "the run's own terms are needed to measure its energies"
             raise InputError(what, field="terms", value=self.lacking, mend=mend)
+
+    def evaluate(self, motion: str | MotionFeatures, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
+        """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
+        self.check_terms()
         track = self.track(motion) if isinstance(motion, str) else motion
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
 

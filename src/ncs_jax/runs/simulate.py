@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
+from ncs_jax.energies.inertia import out_of_balance
 from ncs_jax.energies.terms import OwnTerm, StepInputs
 from ncs_jax.energies.total import energies
 from ncs_jax.errors import InputError
@@ -26,7 +27,7 @@ from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.simulation.implicit_euler import SimulationState, Simulator, simulator_from, stepper
-from ncs_jax.simulation.solver.minimise import STANDARD_GRAVITY, Settings, Solution
+from ncs_jax.simulation.solver.minimise import Settings, Solution
 
 __all__ = ["Progress", "Trajectory", "simulate"]
 
@@ -65,7 +66,7 @@ class Trajectory:
 
 @jax.jit
 def _turned(model: Model, turn) -> Array:
-    """Return the gradient, N, of stretch, bending and pins of a garment that is only turned: rounding and nothing else."""
+    """Return how far stretch, bending and pins of a garment that is only turned are out of balance, g: rounding alone."""
     garment, rest = model.garment, model.garment.mesh.rest
     transforms = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
     terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False, own=())
@@ -74,7 +75,7 @@ def _turned(model: Model, turn) -> Array:
         step = StepInputs(vertex_transforms=transforms)
         return sum(energies(x, garment, model.material, step, terms).values(), start=jnp.zeros((), x.dtype))
 
-    return jax.grad(energy)(skin(transforms, rest))
+    return out_of_balance(jax.grad(energy)(skin(transforms, rest)), model.material.density * garment.mesh.vertex_area)
 
 
 def rounding(model: Model) -> float:
@@ -85,10 +86,7 @@ def rounding(model: Model) -> float:
     0.9 to 3.3 times the residual that a simulation cannot go below (`experiments.stability`).
     """
     turn = jnp.asarray(Rotation.from_rotvec(TURN).as_matrix(), model.basis.dtype)
-    gradient = np.asarray(_turned(model, turn), np.float64)
-    mass = np.asarray(model.material.density * model.garment.mesh.vertex_area, np.float64)
-    squares = np.divide((gradient**2).sum(axis=1), mass, out=np.zeros_like(mass), where=mass > 0)
-    return float(np.sqrt(squares.sum() / mass.sum()) / STANDARD_GRAVITY)
+    return float(_turned(model, turn))
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -106,11 +104,12 @@ def simulate(
 ) -> Trajectory:
     """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
 
+    The vertices are of the precision that was computed in.
+
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
             first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
-            after every frame. terms: of one's own, see `energies.terms.OwnTerm`. The vertices are of the precision that was
-            computed in.
+            after every frame. terms: of one's own, see `energies.terms.OwnTerm`.
 
     Raises:
         InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.

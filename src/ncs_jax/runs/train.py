@@ -22,7 +22,7 @@ from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.run import NetworkMaker, Run, assemble, check_own, own_names
 from ncs_jax.scene.spec import Scene, load_scene, scene_from
 from ncs_jax.training.batches import CHUNK, chunks
-from ncs_jax.training.devices import give_back
+from ncs_jax.training.devices import trim_memory
 from ncs_jax.training.step import TrainState
 
 __all__ = ["train"]
@@ -67,7 +67,7 @@ def train(
             check_own(facts, out, terms, network)
         check_writable(out)
     assembly = assemble(scene, terms=terms, network=network)
-    give_back()
+    trim_memory()
     placed = PlacedScene(assembly, scene.training.seed if seed is None else seed)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
@@ -185,7 +185,7 @@ class _Loop:
         self._state, logs = placed.run_chunk(self._state, at, count, self._steps)
         here, logs = placed.local((self._state, logs))
         if self._timed is None:  # this chunk was compiled
-            give_back()
+            trim_memory()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         self._output.tell(self._entry(done, here, energies))
         whole = done % self._every == 0

@@ -22,7 +22,7 @@ __all__ = ["MotionFeatures", "input_joints", "mirror", "motion_features"]
 class MotionFeatures:
     """Motions laid end to end. `start` is the first frame of the motion that a frame belongs to.
 
-    Before its first frame a character is taken to have stood there at rest. `bodies` are what `training.with_bodies` adds.
+    Before its first frame a character is taken to have stood there at rest. `bodies` are what `training.loss.with_bodies` adds.
     A motion that begins far from the world's origin is measured from an `origin` of its own, so that single precision is as
     fine there as here; None: all are measured from the world's.
     """
@@ -40,7 +40,7 @@ class MotionFeatures:
         return x if self.origin is None else x + self.origin[:, None]
 
     def relative(self, x: Float[Array | np.ndarray, "frames verts 3"]) -> np.ndarray:
-        """Return the other way round, of any array, as NumPy."""
+        """Return world positions (frames, verts, 3), m, measured from the motion's own origin, as NumPy."""
         return np.asarray(x) if self.origin is None else np.asarray(x) - np.asarray(self.origin)[: len(x), None]
 
 
@@ -75,14 +75,20 @@ def motion_features(
     return MotionFeatures(static, dynamic, transforms(model.skeleton, pose), start)
 
 
-def mirror(poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def mirror(
+    poses: np.ndarray, translation: np.ndarray, partner: np.ndarray, axis: int = 0, axes: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the motion in a mirror across the character's middle: a new one, the given one is left as it is.
 
     Args:
         poses: (frames, joints, 3) axis-angle. translation: (frames, 3) m. partner: (joints,) the joint on the other side, or
             itself. axis: the axis from left to right. An axis-angle vector is a pseudovector: its component along the mirror's
-            normal keeps its sign and the others change theirs.
+            normal keeps its sign and the others change theirs. axes: (joints, 3, 3) the axes of each joint at rest that its
+            pose is written in; None where they are the world's.
     """
     sign = -np.ones(3, poses.dtype)
     sign[axis] = 1
-    return poses[:, partner] * sign, translation * -sign
+    if axes is None:
+        return poses[:, partner] * sign, translation * -sign
+    world = np.einsum("jab,tjb->tja", axes, poses)[:, partner] * sign
+    return np.einsum("jba,tjb->tja", axes, world).astype(poses.dtype), translation * -sign

@@ -18,13 +18,13 @@ from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
 
-__all__ = ["Model", "RitzModes", "local_rotations", "pose_body", "pose_garment", "posed_bodies"]
+__all__ = ["Layer", "Model", "RitzModes", "local_rotations", "pose_body", "pose_garment", "pose_rest", "posed_bodies"]
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RitzModes:
-    """Movements of a garment about its drape, in unposed space: see `vibration.softest`.
+    """Movements of a garment about its drape, in unposed space: see `ritz_modes.softest_ritz_modes`.
 
     directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
     """
@@ -106,6 +106,11 @@ def pose_garment(
     rest = model.garment.mesh.rest
     rest = rest.reshape(rest.shape + (1,) * (offsets.ndim - 2))
     return skin(blend(matrices, model.blend if weights is None else weights), rest + offsets)
+
+
+def pose_rest(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, "verts 3"]:
+    """Return the garment as the body alone carries it, equation (16) without offsets, m."""
+    return skin(blend(matrices, model.blend), model.garment.mesh.rest)
 
 
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:

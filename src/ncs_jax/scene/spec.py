@@ -279,6 +279,8 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
         raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not TOML: {error}", file=file, mend="correct that line") from None
+    if preset is not None and preset not in PRESETS:
+        raise InputError(f"one of {', '.join(PRESETS)} expected", field="preset", value=preset)
     for table, values in PRESETS[preset].items() if preset else ():
         if isinstance(own := tables.get(table, {}), dict):
             tables[table] = {**own, **values}

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ncs_jax.energies.contact.safe_steps import yielding
+from ncs_jax.energies.contact.safe_steps import limit_approach
 from ncs_jax.geometry.skinning import blend, forward, skin, unpose
 from ncs_jax.geometry.skinning import transforms as joint_transforms
 from ncs_jax.scene.features import MotionFeatures
@@ -41,7 +41,7 @@ from ncs_jax.simulation.solver.stiffness import Couplings, couplings_from
 APPROACH = 8  # safe steps towards where the next frame is sought,
 WORTH = 0.1  # each at least so much of the way
 
-__all__ = ["Simulation", "Simulator", "simulate", "simulator_from", "stepper"]
+__all__ = ["Simulation", "SimulationState", "Simulator", "simulate", "simulator_from", "stepper"]
 
 
 @jax.tree_util.register_dataclass
@@ -103,7 +103,7 @@ def _approached(problem: Problem, x: Float[Array, "verts 3"], *targets: Float[Ar
 
         def go(state):
             x, _, count, neighbours = state
-            way = yielding(x, target - x, neighbours.pairs)
+            way = limit_approach(x, target - x, neighbours.pairs)
             t = collision_free_step(with_neighbours(problem, neighbours), x, way)
             x = jnp.where(t < WORTH, x, x + t * way)
             return x, t, count + 1, find_neighbours(problem, x)
@@ -180,9 +180,9 @@ def simulate(
     """Return the vertices over one whole motion (frames, verts, 3) in m, and how every frame's solve went.
 
     Args:
-        simulator: from `simulator_from`. track: of one motion, from `motion.track`. settings: tolerance and iterations.
-        state: to go on from, measured from the track's origin; else the motion begins at rest. forces: external ones (frames,
-            verts, 3) in N.
+        simulator: from `simulator_from`. track: of one motion, from `features.motion_features`. settings: tolerance and
+            iterations. state: to go on from, measured from the track's origin; else the motion begins at rest. forces:
+            external ones (frames, verts, 3) in N.
 
     It may be differentiated in reverse with respect to the simulator's material and rest state, the track's transforms, the
     state and the forces: by the implicit function theorem, so memory grows with frames and not with iterations.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ncs_jax.energies.inertia import G, out_of_balance
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.features import MotionFeatures
@@ -19,7 +20,6 @@ from ncs_jax.simulation.solver.problem import (
     Problem,
     evaluate,
     find_neighbours,
-    imbalance,
     line_search,
     static_step,
     stiffness_blocks,
@@ -83,11 +83,10 @@ def _drape(problem: Problem, x):
 
     What `implicit_euler` does, on the host: that is slower a step, and has no factorisation of its own to compile.
     """
-    mass = jnp.sum(problem.mass)
     for _ in range(STEPS):
         near, point, found = _evaluated(problem, x)
         diagonal, off = (np.asarray(block, np.float64) for block in found)
-        if jnp.sqrt(jnp.sum(imbalance(near, point.gradient)) / mass) < ENOUGH[x.dtype]:
+        if G * out_of_balance(point.gradient, near.mass) < ENOUGH[x.dtype]:
             break
         p = _solved(_matrix(problem, diagonal, off), -np.asarray(point.gradient, np.float64).ravel())
         x, moved = _descended(near, x, point, jnp.asarray(p.reshape(x.shape), x.dtype))

@@ -16,7 +16,7 @@ from jax.sharding import PartitionSpec as P
 
 from ncs_jax.errors import InputError
 
-__all__ = ["batch_mesh", "compiled", "copied", "divided", "free_memory", "give_back", "local"]
+__all__ = ["batch_mesh", "compiled", "free_memory", "local", "replicate", "shard_batch", "trim_memory"]
 
 
 def batch_mesh(batch: int) -> Mesh | None:
@@ -34,7 +34,7 @@ def batch_mesh(batch: int) -> Mesh | None:
     return None if len(chosen) == 1 else Mesh(np.array(chosen), ("batch",))
 
 
-def copied(mesh: Mesh | None, tree):
+def replicate(mesh: Mesh | None, tree):
     """Return the first process's arrays on every device."""
     if mesh is None:
         return tree
@@ -45,7 +45,7 @@ def copied(mesh: Mesh | None, tree):
     return _spread(NamedSharding(mesh, P()), tree)
 
 
-def divided(mesh: Mesh | None, tree):
+def shard_batch(mesh: Mesh | None, tree):
     """Return arrays (steps, batch), the same in every process, with each device's part of the batch on it."""
     return tree if mesh is None else _spread(NamedSharding(mesh, P(None, "batch")), tree)
 
@@ -98,7 +98,7 @@ def compiled(program, *arguments):
     return lambda *arguments: ready(*jax.tree.leaves(arguments))
 
 
-def give_back() -> None:
+def trim_memory() -> None:
     """Return to the system what reading and compiling leave over, 200 MB that glibc would keep."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)

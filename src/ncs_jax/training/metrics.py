@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.total import distances
+from ncs_jax.geometry.mesh import edge_strain
 from ncs_jax.geometry.numerics import norm
 from ncs_jax.network.methods.method import Method, decode, garment_blend
 from ncs_jax.scene.features import MotionFeatures
@@ -37,9 +38,7 @@ def training_metrics(
     def one(args):
         offset, matrices = args
         x = pose_garment(model, offset, matrices, weights)
-        length = norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]])
-        strain = jnp.abs(length / jnp.where(mesh.edge_length > 0, mesh.edge_length, 1) - 1)
-        result = {"strain": 100 * jnp.mean(strain)}
+        result = {"strain": 100 * jnp.mean(edge_strain(x, mesh))}
         if model.terms.collision is not None:
             d = distances(x, pose_body(model, matrices), model.surface, model.terms)
             result["penetrating"] = 100 * jnp.mean(d < 0)

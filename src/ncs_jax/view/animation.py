@@ -14,7 +14,7 @@ __all__ = ["Animation", "PosedBody", "upright"]
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:
-    """Hold what a garment is worn on, over a motion.
+    """A posed body: what a garment is worn on, over a motion.
 
     Attributes:
         vertices: (frames, body, 3), m. faces: (faces, 3).
@@ -33,12 +33,15 @@ class PosedBody:
         object.__setattr__(self, "vertices", _vertices(self.vertices, "body"))
         object.__setattr__(self, "faces", _faces(self.faces, self.vertices.shape[1], "body_faces"))
         if not 0 <= self.worn <= self.vertices.shape[1]:
-            raise InputError(f"0 to {self.vertices.shape[1]} vertices of the body", field="worn", value=self.worn)
+            raise InputError(
+                f"0 to {self.vertices.shape[1]} vertices of the body expected", field="worn", value=self.worn,
+                mend="count the last vertices, those of the garments worn below",
+            )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """Hold what pictures and pages draw: a garment over time, and the body that it is worn on.
+    """An animation that pictures and pages draw: a garment over time, and the body that it is worn on.
 
     `view.character.animation_of` makes one from a run and a motion. Vertices may be NaN: a picture leaves them out.
 
@@ -61,11 +64,14 @@ class Animation:
         object.__setattr__(self, "garment", _vertices(self.garment, "garment"))
         object.__setattr__(self, "garment_faces", _faces(self.garment_faces, self.garment.shape[1], "garment_faces"))
         if not (np.isfinite(self.fps) and self.fps > 0):
-            raise InputError("frames per second above 0", field="fps", value=self.fps)
+            raise InputError(
+                "frames per second above 0 expected", field="fps", value=self.fps, mend="give the frame rate of the motion"
+            )
         if self.body is not None and len(self.body.vertices) != len(self.garment):
             raise InputError(
-                f"{len(self.garment)} frames, as many as the garment has", field="body", value=len(self.body.vertices)
-            )
+                f"{len(self.garment)} frames, as many as the garment has, expected", field="body",
+                value=len(self.body.vertices), mend="pose the body by the motion that the garment was animated over",
+            )  # fmt: skip
         _unit(self.up)
 
     def y_up(self) -> Animation:
@@ -97,21 +103,30 @@ def _unit(up: Sequence[float]) -> np.ndarray:
     u = np.asarray(up, float)
     length = np.linalg.norm(u)
     if u.shape != (3,) or not np.isfinite(length) or length == 0:
-        raise InputError("a direction of three numbers, not all zero", field="up", value=up)
+        raise InputError("a direction of three numbers, not all zero, expected", field="up", value=up, mend="give (0, 1, 0)")
     return u / length
 
 
 def _vertices(vertices, name: str) -> np.ndarray:
     vertices = np.asarray(vertices)
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
-        raise InputError("vertices of shape (frames, verts, 3)", field=name, value=vertices.shape)
+        raise InputError(
+            "vertices of shape (frames, verts, 3) expected", field=name, value=vertices.shape,
+            mend="give at least one frame and one vertex",
+        )  # fmt: skip
     return vertices
 
 
 def _faces(faces, count: int, name: str) -> np.ndarray:
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-        raise InputError("whole numbers of shape (faces, 3)", field=name, value=(faces.shape, str(faces.dtype)))
+        raise InputError(
+            "whole numbers of shape (faces, 3) expected", field=name, value=(faces.shape, str(faces.dtype)),
+            mend="cut polygons into triangles, and give their vertices' numbers",
+        )  # fmt: skip
     if faces.size and (faces.min() < 0 or faces.max() >= count):
-        raise InputError(f"vertex numbers from 0 to {count - 1}", field=name, value=(int(faces.min()), int(faces.max())))
+        raise InputError(
+            f"vertex numbers from 0 to {count - 1} expected", field=name, value=(int(faces.min()), int(faces.max())),
+            mend="counting starts at 0; give the faces of these vertices",
+        )  # fmt: skip
     return faces

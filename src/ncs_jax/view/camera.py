@@ -13,7 +13,7 @@ __all__ = ["Camera", "Projection"]
 
 @dataclass(frozen=True)
 class Camera:
-    """Say where a picture is taken from.
+    """A camera: where a picture is taken from.
 
     Attributes:
         target: (3,) point in the middle of the picture, m. width, height: what must be in sight around it, m.
@@ -45,7 +45,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Projection:
-    """Hold how a camera maps the world into a picture.
+    """A projection: how a camera maps the world into a picture.
 
     Attributes:
         axes: right, up and forward, rows. target: (3,), m. distance: of the camera from the target, m. focal: length in pixels.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ncs_jax.energies.terms import MEASURED, NAMES
 from ncs_jax.errors import InputError
 from ncs_jax.view.pictures import FAINT, INK
 from ncs_jax.view.rasteriser import PAPER
@@ -17,15 +18,18 @@ __all__ = ["energy_curves"]
 
 TERMS = {
     "membrane": "#d9643f",
-    "stretch": "#d9643f",
     "bending": "#8c5aa8",
     "collision": "#3b7dbf",
-    "self_collision": "#2b4f81",
+    "friction": "#7fb2d9",
+    "self_contact": "#2b4f81",
     "gravity": "#5d9a54",
     "inertia": "#c79a2b",
     "pinning": "#7a7470",
+    "hold": "#b8a68f",
+    "external": "#c46a9d",
 }
-"""The energies that `energy_curves` knows, with their colours."""
+"""The package's energies with their colours."""
+OWN = "#333333"  # of every term of one's own
 
 
 def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str | Path) -> None:
@@ -33,10 +37,13 @@ def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str |
 
     Args:
         path: of the PNG. rows: one mapping a step, or the CSV file that holds them, with columns step, total, the terms (see
-        `TERMS`), strain, penetrating, and validation_total, validation_strain_mean and validation_penetrating. Other columns,
-        and values that are empty or no number, are ignored.
+            `TERMS`), strain, penetrating, and validation_total, validation_strain_mean and validation_penetrating. A column
+            of another name is a term of one's own. Values that are empty or no number are ignored.
 
     Needs matplotlib, which the `plots` extra installs; its global state is left alone.
+
+    Raises:
+        InputError: no row has a step and a total.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -46,7 +53,9 @@ def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str |
             rows = list(csv.DictReader(file))
     columns = _columns(rows)
     if "total" not in columns:
-        raise InputError("at least one row with a step and a total", field="rows", value=len(rows))
+        raise InputError(
+            "at least one row with a step and a total expected", field="rows", value=len(rows), mend="give the log.csv of a run"
+        )
     quality = [name for name in ("strain", "penetrating") if name in columns or f"validation_{name}" in columns]
     figure = Figure(figsize=(4.6 * (2 + bool(quality)), 3.9), dpi=150, facecolor=_hex(PAPER), layout="constrained")
     FigureCanvasAgg(figure)
@@ -57,9 +66,10 @@ def energy_curves(path: str | Path, rows: Sequence[Mapping[str, object]] | str |
             axes[0].plot(*columns[name], color=_hex(INK), marker="o", markersize=3.5, linewidth=1.4, label="validation")
             break
     _style(axes[0], "Total energy, J", [columns[n] for n in ("total", "validation_total") if n in columns])
-    terms = [name for name in TERMS if name in columns and np.any(columns[name][1] != 0)]
+    own = [name for name in columns if name not in (*NAMES, *MEASURED) and not name.startswith("validation")]
+    terms = [name for name in (*TERMS, *own) if name in columns and np.any(columns[name][1] != 0)]
     for name in terms:
-        _curve(axes[1], columns[name], TERMS[name], name.replace("_", " "))
+        _curve(axes[1], columns[name], TERMS.get(name, OWN), name.replace("_", " "))
     _style(axes[1], "Its terms, J", [columns[name] for name in terms])
     if quality:
         labels = {"strain": ("mean strain", "#d9643f"), "penetrating": ("penetrating vertices", "#3b7dbf")}

@@ -28,7 +28,7 @@ _TABLE = np.where(_STEPS <= 0.0031308, 12.92 * _STEPS, 1.055 * _STEPS ** (1 / 2.
 
 
 class ShadowMap:
-    """Tell what the sun reaches, from one picture of nearness taken along its direction."""
+    """A shadow map: what the sun reaches, from one picture of nearness taken along its direction."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, direction: np.ndarray, size: int = 512) -> None:
         """Draw the meshes as the sun sees them; direction points towards the sun, of length one."""

@@ -14,12 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import triangle_distance
-from ncs_jax.energies.contact.nearest import nearest_triangle
+from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.skinning import blend, skin
-from ncs_jax.metrics.motion import unposed
+from ncs_jax.geometry.mesh import edge_strain
+from ncs_jax.metrics.motion import carried, unposed
 from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
@@ -76,16 +75,11 @@ def animated_garment(target: str, scene: str | None = None, motion: str | None =
 
         def follow_skin(name: str, alpha: float) -> np.ndarray:
             track = run.track(name)
-            return np.asarray(track.absolute(_skinned_rest(run.assembly.model, track.matrices)))
+            return np.asarray(track.absolute(carried(run.assembly.model, track.matrices)))
 
         return AnimatedGarment(run, motions, follow_skin, False, target)
     vertices = read_animation_over(target, run.assembly.model, run.track(motions[0]))
     return AnimatedGarment(run, motions[:1], lambda name, alpha: vertices, False, path.name)
-
-
-@jax.jit
-def _skinned_rest(model: Model, matrices):
-    return jax.lax.map(lambda m: skin(blend(m, model.blend), model.garment.mesh.rest), matrices)
 
 
 def _motions(motion: str | None, spec) -> tuple[str, ...]:
@@ -97,9 +91,7 @@ def _motions(motion: str | None, spec) -> tuple[str, ...]:
 
 @jax.jit
 def _depth(model: Model, surface: Surface, x, matrices):
-    body = pose_body(model, matrices)
-    index, _ = nearest_triangle(x, body, surface)
-    return -triangle_distance(x, body, surface, index)
+    return -nearest_distance(x, pose_body(model, matrices), surface)
 
 
 def vertex_values(
@@ -109,8 +101,7 @@ def vertex_values(
     model, x = run.assembly.model, vertices[frame]
     if name == "strain":
         mesh = model.garment.mesh
-        edges, length = np.asarray(mesh.edges), np.asarray(mesh.edge_length)
-        strain = 100 * np.abs(np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1) / np.where(length > 0, length, 1) - 1)
+        edges, strain = np.asarray(mesh.edges), 100 * np.asarray(jax.jit(edge_strain)(x, mesh))
         total = sum(np.bincount(edges[:, k], strain, len(x)) for k in (0, 1))
         return total / np.maximum(np.bincount(edges.ravel(), minlength=len(x)), 1)
     if name.startswith("speed"):

@@ -69,16 +69,20 @@ def _scene(animations: dict[str, Animation]) -> tuple[dict[str, object], dict[st
 def _checked(animations: Mapping[str, Animation]) -> dict[str, Animation]:
     """Return the animations with Y up, checked to be finite and alike."""
     if not animations:
-        raise InputError("at least one animation", field="animations")
+        raise InputError("at least one animation expected", field="animations", mend="give one by its alpha, such as '1'")
     label, first = next(iter(animations.items()))
     for name, each in animations.items():
         field = f"animations[{name!r}]"
         if each.garment.shape != first.garment.shape:
             raise InputError(
-                f"shape {first.garment.shape}, as animations[{label!r}] has", field=field, value=each.garment.shape
-            )
+                f"the shape of animations[{label!r}], {first.garment.shape}, expected", field=field, value=each.garment.shape,
+                mend="animate one garment over one motion",
+            )  # fmt: skip
         if not _alike(each, first):
-            raise InputError(f"faces, body, frame rate and up as animations[{label!r}] has", field=field)
+            raise InputError(
+                f"faces, body, frame rate and up of animations[{label!r}] expected", field=field,
+                mend="animate one garment over one motion",
+            )  # fmt: skip
         _check_finite(each.garment, field)
     if first.body is not None:
         _check_finite(first.body.vertices, "body")
@@ -100,9 +104,15 @@ def _check_finite(vertices: np.ndarray, name: str) -> None:
     if len(bad):
         frame, vertex = bad[0].tolist()
         value = vertices[frame, vertex].tolist()
-        raise InputError(f"finite positions, but vertex {vertex} of frame {frame} is not", field=name, value=value)
+        raise InputError(
+            f"finite positions, also of vertex {vertex} in frame {frame}, expected", field=name, value=value,
+            mend="leave out the frames from there on",
+        )  # fmt: skip
     if np.abs(vertices).max() > 1e6:
-        raise InputError("positions in m, within 1e6", field=name, value=float(np.abs(vertices).max()))
+        raise InputError(
+            "positions in m within 1e6 expected", field=name, value=float(np.abs(vertices).max()),
+            mend="give metres, and move the motion nearer to the origin",
+        )  # fmt: skip
 
 
 def _faces(faces: np.ndarray) -> str:

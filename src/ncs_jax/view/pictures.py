@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import cKDTree
 
+from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
@@ -144,6 +145,8 @@ def contact_sheet(
     """
     stage = _stage(animation)
     chosen = np.unique(np.linspace(0, stage.frames - 1, max(1, frames)).round().astype(int)).tolist()
+    if labels and len(labels) != len(chosen):
+        raise InputError(f"a label for each of {len(chosen)} moments expected", field="labels", value=len(labels))
     headings = [stage.heading(frame) for frame in chosen]
     bounds = [[stage.bounds(frame, turn + VIEWS[view]) for frame, turn in zip(chosen, headings, strict=True)] for view in _ROWS]
     low, high = min(each[1] for row in bounds for each in row), max(each[2] for row in bounds for each in row)
@@ -186,6 +189,8 @@ def animation_gif(
         path: of the GIF. animation: to draw. max_frames: of the GIF; a longer animation is cut there. size: width and height in
             pixels. view: one of `VIEWS`. max_bytes: colours and then frames are dropped until it is no larger.
     """
+    if view not in VIEWS:
+        raise InputError(f"one of {', '.join(VIEWS)} expected", field="view", value=view)
     stage, fps = _stage(animation), animation.fps
     stride = max(1, math.floor(fps / 15 + 0.5))
     chosen = np.arange(0, stage.frames, stride)[: max(1, max_frames)]

@@ -25,6 +25,9 @@ def preview(run: Run, folder: str | Path, motion: str | None = None, *, title: s
 
     Args:
         run: trained. folder: where to. motion: a motion's name or file; else the scene's first validation or training motion.
+
+    Raises:
+        InputError: there is no motion to show, it is unusable, a vertex is not finite, or the run's own terms were not given.
     """
     folder = Path(folder)
     scene = run.assembly.scene

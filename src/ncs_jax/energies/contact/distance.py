@@ -6,12 +6,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.surface import Surface, face_normals
 from ncs_jax.geometry.closest_point import closest_weights, gap_to
 from ncs_jax.geometry.numerics import angle_between, normalize
 from ncs_jax.geometry.soa_vectors import dot, minus
 
-__all__ = ["plane_distance", "triangle_distance"]
+__all__ = ["nearest_distance", "plane_distance", "triangle_distance"]
 
 
 def plane_distance(
@@ -57,6 +58,13 @@ def triangle_distance(
     within = jnp.all(weights > 0, axis=-1, keepdims=True) & ~rim
     direction = jnp.where(touching | within | (side == 0), normal, side * away / jnp.where(touching, 1, length))
     return jnp.sum(direction * gap, axis=-1)
+
+
+def nearest_distance(
+    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, *, exact: bool = True
+) -> Float[Array, "verts"]:
+    """Return `triangle_distance` to the triangle that `nearest_triangle` finds, m."""
+    return triangle_distance(x, body, surface, nearest_triangle(x, body, surface, exact=exact)[0])
 
 
 def _pseudo_normal(body, surface, index, weights):

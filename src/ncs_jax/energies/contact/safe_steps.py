@@ -21,7 +21,7 @@ from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.numerics import norm
 from ncs_jax.geometry.soa_vectors import dot
 
-__all__ = ["free_share", "swept_share", "yielding"]
+__all__ = ["free_share", "limit_approach", "swept_share"]
 
 
 PASSES = 16  # over the pairs until none is brought too near
@@ -65,7 +65,7 @@ def free_share(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pa
     return jnp.minimum(jnp.min(listed, initial=1), 0.9 * radius / jnp.maximum(far, 0.9 * radius))
 
 
-def yielding(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs) -> Float[Array, "verts 3"]:
+def limit_approach(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pairs) -> Float[Array, "verts 3"]:
     """Return the move p (m) without what would bring the listed pairs of x nearer than a fifth of their distance.
 
     A plane across n midway between the two goes with them, at the mean of their vertices' speeds along n. What carries a vertex
@@ -104,8 +104,8 @@ def yielding(x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], pairs: Pair
 def swept_share(
     x: Float[Array, "verts 3"], p: Float[Array, "verts 3"], mesh: Mesh, groups: Groups
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """As `free_share`, of all pairs whose ways' boxes overlap, however long the way; and whether the search that finds them ran
-    out of room."""
+    """Return the share of the move p that is free of collision, over all pairs whose swept boxes overlap; and whether the
+    search overflowed."""
     x, p = lax.stop_gradient(x), _relative(lax.stop_gradient(p))
 
     def share(first, second, weigh, most):

@@ -1,6 +1,6 @@
 """Self-contact: cloth that keeps its distance from itself, pair by pair of point and triangle and of edge and edge.
 
-The pairs come from `proximity.nearby_pairs`. Every pair is a spring along one direction n between two points that weights w_i
+The pairs come from `pairs.nearby_pairs`. Every pair is a spring along one direction n between two points that weights w_i
 take from its four vertices, so energy, gradient and Hessian along n are sums of a gather and a scatter over the pairs.
 """
 

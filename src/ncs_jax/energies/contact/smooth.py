@@ -21,7 +21,7 @@ __all__ = ["BlendedContact", "Quadrics", "blended_contact", "curvatures", "nearb
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Quadrics:
-    """The body near every group of cloth, as `blended` takes it: one quadric a body vertex, seen from the group's centre, m."""
+    """The body near every group of cloth, for `blended_contact`: one quadric a body vertex, seen from the group's centre, m."""
 
     centres: Float[Array, "*blocks 1 3"]
     points: Float[Array, "*blocks near 3"]  # the body's vertices
@@ -75,13 +75,13 @@ def nearby_quadrics(x: Float[Array, "verts 3"], body: Float[Array, "body 3"], su
     """Return the quadrics of the groups of body vertices that lie nearest to every group of cloth vertices."""
     blocks = surface.vertex_blocks
     cloth = lax.stop_gradient(x)[surface.cloth_blocks]
-    _, chosen = nearest_groups(cloth, lax.stop_gradient(body)[blocks], surface.groups)
+    chosen = nearest_groups(cloth, lax.stop_gradient(body)[blocks], surface.groups)
     names = blocks[chosen].reshape(len(cloth), -1)
     first = jnp.concatenate([jnp.ones_like(blocks[:, :1], bool), blocks[:, 1:] != blocks[:, :-1]], axis=1)
     once = first[chosen].reshape(names.shape)
     normals = vertex_normals(body, surface)
     table = jnp.concatenate([body, normals, curvatures(body, normals, surface).reshape(-1, 9)], axis=1)[names]
-    centres = jnp.mean(cloth, axis=1, keepdims=True)  # near it no product of `blended` cancels
+    centres = jnp.mean(cloth, axis=1, keepdims=True)  # near it no product of `blended_contact` cancels
     points, n, bend = table[..., :3] - centres, table[..., 3:6], table[..., 6:].reshape(*names.shape, 3, 3)
     turn = jnp.sum(bend * points[..., None, :], axis=-1)
     second = jnp.stack([bend[..., i, j] * (0.5 if i == j else 1) for i, j in PAIRS], axis=-1)

@@ -77,7 +77,7 @@ def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
 
 
 def rebuild_lists(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
-    """Return the same with its search for the nearest vertex prepared for what is near what in these poses [(cloth, body)]."""
+    """Return the surface with new candidate lists for the nearest-vertex search, from poses [(cloth, body)]."""
     lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
     return replace(surface, vertex_lists=jax.device_put(lists))
 

@@ -13,7 +13,7 @@ from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.records import BodyRecord
 from ncs_jax.io.tables.files import LARGEST
 from ncs_jax.io.tables.npz import read_npz
-from ncs_jax.io.tables.table import Table, indices, shares, tree
+from ncs_jax.io.tables.table import Table, checked_parents, indices, normalised_weights
 
 __all__ = ["read_body"]
 
@@ -73,7 +73,7 @@ def read_body(path: str | Path) -> BodyRecord:
             mend="write vertices and joints unposed, and rest_pose as zeros",
         )  # fmt: skip
     return BodyRecord(
-        vertices, faces, joints, tree(table.file, "parents", table.array("parents"), len(joints), names),
+        vertices, faces, joints, checked_parents(table.file, "parents", table.array("parents"), len(joints), names),
         _weights(table, len(vertices), len(joints)), names, _rest_rotations(table, len(joints)),
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ def _model(table: Table) -> Table:
     kintree = table.array("kintree_table")
     if kintree.ndim != 2 or len(kintree) != 2:
         raise InputError("shape (2, J) expected", file=table.file, field="kintree_table", value=kintree.shape)
-    parents = tree(table.file, "kintree_table", kintree[0], kintree.shape[1])
+    parents = checked_parents(table.file, "kintree_table", kintree[0], kintree.shape[1])
     count = len(parents)
     if "J_regressor" in table:
         joints = table.floats("J_regressor", (count, len(vertices)), ("joint",)) @ vertices
@@ -136,7 +136,7 @@ def _weights(table: Table, vertices: int, joints: int) -> np.ndarray:
             )
         weights = np.zeros((vertices, joints), sparse.dtype)
         np.add.at(weights, (np.arange(vertices)[:, None], owner), sparse)
-    return shares(table.file, field, weights)
+    return normalised_weights(table.file, field, weights)
 
 
 def _rest_rotations(table: Table, joints: int) -> np.ndarray | None:

@@ -81,7 +81,7 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
     tips: list[list[float]] = []
     channels: list[list[tuple[str, int]]] = []
     open_joints: list[int] = []  # -1 stands for an end site
-    words = _words(file, text)
+    words = _words(text)
     for line, word in words:
         key = word.lower()
         where = f"line {line}"
@@ -143,7 +143,7 @@ def _check_whole(file: Path, names: list[str], offsets: list[list[float]], unclo
         )
 
 
-def _words(file: Path, text: str) -> Iterator[tuple[int, str]]:
+def _words(text: str) -> Iterator[tuple[int, str]]:
     """Yield line number and word of all words, and at the end an empty word, which nothing accepts."""
     line = 0
     for line, content in enumerate(text.splitlines(), 1):

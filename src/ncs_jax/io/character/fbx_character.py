@@ -273,7 +273,7 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
                             "bake the layers",
                         )
                     curves[where] = curve_from(graph.fbx, curve, f"{kind} of {graph.models[model].name}", TICK)
-                _still(graph, record, model, kind, curves)
+                _still(record, model, kind, curves)
     if not curves:
         raise graph.fbx.wrong("curves of some joint expected", "AnimationStack", names, "write FILE#NAME with another of these")
     times = _properties(stack)
@@ -283,7 +283,7 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
     return float(begin), float(end), curves
 
 
-def _still(graph: Graph, record: Record, model: int, kind: str, curves: dict) -> None:
+def _still(record: Record, model: int, kind: str, curves: dict) -> None:
     """Add constant curves, where the curve node gives a value, for axes that have no curve."""
     given = _properties(record)
     for axis, letter in enumerate("XYZ"):

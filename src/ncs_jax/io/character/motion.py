@@ -16,7 +16,7 @@ from ncs_jax.io.character.rig import split_clip
 from ncs_jax.io.records import MotionRecord
 from ncs_jax.io.tables.hdf5 import read_hdf5
 from ncs_jax.io.tables.npz import read_npz
-from ncs_jax.io.tables.table import Table, floats, select, tree
+from ncs_jax.io.tables.table import Table, checked_parents, floats, select
 
 __all__ = ["read_motion"]
 
@@ -80,7 +80,7 @@ def read_motion(
         up = "" if "fps" in table else "z"
         if "parents" in table and "joints" in table:
             joints = table.floats("joints", (poses.shape[1], 3), ("joint",))
-            parents = tree(file, "parents", table.array("parents"), poses.shape[1], names)
+            parents = checked_parents(file, "parents", table.array("parents"), poses.shape[1], names)
             skeleton = MotionSkeleton(joints * joints.dtype.type(scale), parents, None)
         if translation.shape != (len(poses), 3):
             raise InputError(

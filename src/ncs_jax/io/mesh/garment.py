@@ -16,7 +16,7 @@ from ncs_jax.io.mesh.usd import USD, read_usd_mesh
 from ncs_jax.io.mesh.weld import weld as same_places
 from ncs_jax.io.records import GarmentRecord
 from ncs_jax.io.tables.npz import read_npz, write_npz
-from ncs_jax.io.tables.table import floats, indices, shares
+from ncs_jax.io.tables.table import floats, indices, normalised_weights
 
 __all__ = ["read_garment", "write_garment"]
 
@@ -81,14 +81,20 @@ def read_garment(path: str | Path, *, scale: float = 0.0, up: str = "", weld: fl
     if uv is not None:
         uv = uv[kept] if np.array_equal(uv[kept][number], uv) else None
     if weights is not None:
-        weights = shares(file, WEIGHTS, floats(file, WEIGHTS, weights, (verts, "J"), ("vertex", "joint")))[kept]
+        weights = normalised_weights(file, WEIGHTS, floats(file, WEIGHTS, weights, (verts, "J"), ("vertex", "joint")))[kept]
     sets = {n: number[indices(file, GROUP + n, a, ("N",), verts, "vertices")] for n, a in groups.items()}
     sets = {n: np.unique(a).astype(np.int32) for n, a in sets.items()}
     return GarmentRecord(x, faces, uv, sets, unit, axis, verts - len(x), weights)
 
 
 def write_garment(path: str | Path, garment: GarmentRecord) -> None:
-    """Write all that a record holds as .npz; the file appears whole or not at all."""
+    """Write all that a record holds as .npz; the file appears whole or not at all.
+
+    Raises:
+        InputError: the file's name ends in something else.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise InputError("a file name that ends in .npz expected", file=path, mend="name it so")
     more = {"uv": garment.uv, WEIGHTS: garment.weights}
     groups = {GROUP + name: vertices for name, vertices in garment.groups.items()}
     arrays = {name: a for name, a in more.items() if a is not None}

@@ -1,40 +1,14 @@
-"""Checks that triangles are an oriented manifold without loose vertices, as cloth must be; its boundary and its parts."""
+"""Checks that triangles are an oriented manifold without loose vertices, as cloth must be; its boundary."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["SurfaceSummary", "boundary_loops", "check_surface", "summarise_surface"]
-
-FLAT = 1e-6  # height of a triangle, of its longest edge, below which it is degenerate: float32 cannot tell it from a line
-
-
-@dataclass(frozen=True)
-class SurfaceSummary:
-    """Numbers of a surface: connected components, loops of the boundary (holes), triangles too slim to have a normal."""
-
-    components: int
-    loops: int
-    degenerate: int
-
-
-def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
-    """Count the components, holes and degenerate triangles of a surface that `check_surface` has passed."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    graph = coo_array((np.ones(len(half), bool), tuple(half.T)), shape=(len(x), len(x)))
-    a, b, c = (x[faces[:, k]].astype(np.float64) for k in range(3))
-    longest = np.max([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    components = int(connected_components(graph, directed=False)[0])
-    return SurfaceSummary(components, len(boundary_loops(faces)), int((double <= FLAT * longest).sum()))
+__all__ = ["boundary_loops", "check_surface"]
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["Table", "floats", "indices", "select", "shares", "tree"]
+__all__ = ["Table", "checked_parents", "floats", "indices", "normalised_weights", "select"]
 
 Shape = tuple[int | str, ...]
 
@@ -80,7 +80,7 @@ def indices(file: Path, field: str, array: np.ndarray, shape: Shape, count: int,
     return array.astype(np.int32)
 
 
-def shares(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
+def normalised_weights(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
     """Return skinning weights (V, J) divided by their sums, after a check: sums are 1 within 1e-3, no weight is negative."""
     low, sums = weights.min(axis=1, initial=0), weights.sum(axis=1, dtype=np.float64)
     for bad, text, value in (
@@ -96,7 +96,7 @@ def shares(file: Path, field: str, weights: np.ndarray) -> np.ndarray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def tree(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[str, ...] = ()) -> np.ndarray:
+def checked_parents(file: Path, field: str, array: np.ndarray, joints: int, names: tuple[str, ...] = ()) -> np.ndarray:
     """Return the parent of each joint (joints,) int32, after a check: one root, joint 0 with -1, parents before children."""
     if array.dtype.kind not in "iu" or array.shape != (joints,):
         raise InputError(

@@ -70,7 +70,7 @@ class Windows:
 
     @property
     def own(self) -> Array:
-        """Which windows move by themselves."""
+        """Return which windows move by themselves."""
         return self.number >= self.augmented
 
 
@@ -98,28 +98,31 @@ class Method(Protocol):
 
     @property
     def decoder(self) -> nn.Module:
-        """From codes to offsets: a Flax module, called with codes (*poses, code) and the garment's smooth modes (verts, modes),
-        that returns offsets (verts, 3, *poses) in unposed space, m. The package's is `network.decoder.Decoder`."""
+        """Return what makes offsets of codes: a Flax module, such as the package's own `network.decoder.Decoder`.
+
+        It is called with codes (*poses, code) and the garment's smooth modes (verts, modes), and returns offsets
+        (verts, 3, *poses) in unposed space, m.
+        """
 
     @property
     def learn_weights(self) -> bool:
-        """Whether the skinning weights are trained too."""
+        """Return whether the skinning weights are trained too."""
 
     @property
     def code(self) -> int:
-        """How many numbers a code has."""
+        """Return how many numbers a code has."""
 
     @property
     def state(self) -> int:
-        """How many numbers are carried from frame to frame."""
+        """Return how many numbers are carried from frame to frame."""
 
     @property
     def controlled(self) -> bool:
-        """Whether alpha scales anything."""
+        """Return whether alpha scales anything."""
 
     @property
     def refreshes(self) -> bool:
-        """Whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
+        """Return whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Return fresh parameters of all but the decoder."""

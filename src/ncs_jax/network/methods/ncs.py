@@ -32,17 +32,17 @@ class NCS(FromCodes):
 
     @property
     def code(self) -> int:
-        """How many numbers a code has."""
+        """Return how many numbers a code has."""
         return self.static.sizes[-1]
 
     @property
     def state(self) -> int:
-        """The dynamic code is what is carried."""
+        """Return how many numbers are carried from frame to frame: the dynamic code's."""
         return 0 if self.dynamic is None else self.dynamic.state
 
     @property
     def controlled(self) -> bool:
-        """Whether alpha scales anything."""
+        """Return whether alpha scales anything."""
         return self.dynamic is not None
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:

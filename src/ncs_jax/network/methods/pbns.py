@@ -32,7 +32,7 @@ class PBNS(FromCodes):
 
     @property
     def code(self) -> int:
-        """How many numbers a code has."""
+        """Return how many numbers a code has."""
         return self.static.sizes[-1]
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:

@@ -32,12 +32,12 @@ class SNUG(FromCodes):
 
     @property
     def code(self) -> int:
-        """How many numbers a code has."""
+        """Return how many numbers a code has."""
         return self.recurrent.state
 
     @property
     def state(self) -> int:
-        """The code is what is carried."""
+        """Return how many numbers are carried from frame to frame: the code's."""
         return self.recurrent.state
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:

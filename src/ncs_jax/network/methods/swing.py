@@ -1,7 +1,7 @@
 """Neural cloth simulation whose dynamic code is of a swing: how the garment's own soft vibrations answer to the motion.
 
 The swing q is what implicit Euler makes of the energy linearised about the static garment s_t that the network gives, along
-the directions D of `vibration.softest`, carried by skinning, P_t = R_t D:
+the directions D of `ritz_modes.softest_ritz_modes`, carried by skinning, P_t = R_t D:
 
     (G_t (1 + c h) + h^2 E_0) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
 
@@ -59,12 +59,16 @@ class Swing:
 
     @property
     def code(self) -> int:
-        """How many numbers a code has."""
+        """Return how many numbers a code has."""
         return self.static.sizes[-1]
 
     @property
     def state(self) -> int:
-        """The garment in the two frames before, measured from the root, the root, the swing, and whether there was a frame."""
+        """Return how many numbers are carried.
+
+        They are the garment in the two frames before, measured from the root, the root, the swing, and whether there was a
+        frame.
+        """
         return 6 * self.verts + 3 + self.modes + 1
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:

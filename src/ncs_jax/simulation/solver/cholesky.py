@@ -63,7 +63,7 @@ class Factor:
 # --- order, once ----------------------------------------------------------------------------------------------------
 
 
-def _separator(left: np.ndarray, right: np.ndarray, crossing: np.ndarray, verts: int) -> np.ndarray:
+def _separator(crossing: np.ndarray) -> np.ndarray:
     """Fewest vertices that touch every crossing pair (pairs, 2) from left to right: a minimum vertex cover (Koenig)."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import maximum_bipartite_matching
@@ -103,7 +103,7 @@ def _halve(members: np.ndarray, points: np.ndarray, pairs: np.ndarray, verts: in
                 separator = np.zeros(0, np.int64)
             else:
                 crossing = np.where(side[crossing[:, :1]], crossing, crossing[:, ::-1])
-                separator = _separator(members, members, crossing, verts)
+                separator = _separator(crossing)
             parts = np.bincount(side[np.setdiff1d(members, separator)], minlength=2)
             cost = len(separator) * (1 + 4 * abs(parts[0] - parts[1]) / max(parts.sum(), 1))
             if best is None or cost < best[0]:

@@ -43,15 +43,15 @@ def _newton(problem, x, point, memory):
 
     Cloth that touches itself couples vertices that no element does: then the rest of the matrix preconditions the whole.
     """
-    diagonal, off = stiffness_blocks(problem, x, point._replace(folds=None))
-    if point.folds is None:
+    diagonal, off = stiffness_blocks(problem, x, point._replace(repulsion=None))
+    if point.repulsion is None:
         return -solve(problem.order, factorise(problem.order, diagonal, off), point.gradient), memory
     stiff = problem.model.material.self_contact
-    factor = factorise(problem.order, diagonal + self_contact.blocks(point.folds, x, stiff), off)
+    factor = factorise(problem.order, diagonal + self_contact.blocks(point.repulsion, x, stiff), off)
     free = jnp.ones((len(x), 1), x.dtype) if problem.free is None else problem.free[:, None].astype(x.dtype)
 
     def matrix(p):
-        return multiply(problem.couplings, diagonal, off, p) + free * self_contact.product(point.folds, p, stiff)
+        return multiply(problem.couplings, diagonal, off, p) + free * self_contact.product(point.repulsion, p, stiff)
 
     return -conjugate_gradients(matrix, lambda r: solve(problem.order, factor, r), point.gradient, FORCING, TURNS), memory
 

@@ -10,13 +10,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.contact import self_contact
+from ncs_jax.energies.inertia import G, imbalance, out_of_balance
 from ncs_jax.simulation.solver.directions import DIRECTIONS
 from ncs_jax.simulation.solver.patch import SIZE, Patch, pairs_of, patch_around, solve_dense
 from ncs_jax.simulation.solver.problem import (
     Problem,
     evaluate,
     find_neighbours,
-    imbalance,
     line_search,
     max_displacement,
     refresh_neighbours,
@@ -28,7 +28,6 @@ from ncs_jax.simulation.solver.problem import (
 __all__ = ["CONVERGED", "LIMIT", "NOT_FINITE", "STALLED", "Settings", "Solution", "minimise"]
 
 CONVERGED, LIMIT, STALLED, NOT_FINITE = range(4)
-STANDARD_GRAVITY = 9.81  # m/s^2, the unit of residuals
 
 SHARE = 0.5  # of the imbalance that a patch must hold to be worth a solve of its own
 LOCAL = 20  # steps of a patch
@@ -83,16 +82,16 @@ def relax_patch(problem: Problem, x: Float[Array, "verts 3"], neighbours, left: 
 
     def unfinished(state):
         _, point, _, count, moved = state
-        kept = jnp.sum(jnp.where(moves, imbalance(problem, point.gradient), 0))
+        kept = jnp.sum(jnp.where(moves, imbalance(point.gradient, problem.mass), 0))
         return moved & (count < LOCAL) & (kept > 0.25 * tolerance)
 
     def iterate(state):
         x, point, neighbours, count, _ = state
         here, springs = local(neighbours), None
-        if point.folds is not None:
-            v = self_contact.springs(point.folds, problem.model.material.self_contact)
-            springs = point.folds.vertices, v if problem.free is None else v * problem.free[point.folds.vertices][..., None]
-        p = -solve_dense(patch, *stiffness_blocks(here, x, point._replace(folds=None)), point.gradient, springs)
+        if point.repulsion is not None:
+            v, at = self_contact.springs(point.repulsion, problem.model.material.self_contact), point.repulsion.vertices
+            springs = at, v if problem.free is None else v * problem.free[at][..., None]
+        p = -solve_dense(patch, *stiffness_blocks(here, x, point._replace(repulsion=None)), point.gradient, springs)
         x, point, _, moved = line_search(here, None, x, point, p)
         if problem.model.terms.self_contact:
 
@@ -131,8 +130,8 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         if direction.patches and x.shape[0] > 4 * SIZE:
 
             def relax(x, point, neighbours):
-                enough = mass * (tolerance * STANDARD_GRAVITY) ** 2
-                x, neighbours, count = relax_patch(problem, x, neighbours, imbalance(problem, point.gradient), enough)
+                enough = mass * (tolerance * G) ** 2
+                x, neighbours, count = relax_patch(problem, x, neighbours, imbalance(point.gradient, problem.mass), enough)
                 point = lax.cond(count > 0, lambda: evaluate(with_neighbours(problem, neighbours), x), lambda: point)
                 return x, point, neighbours, *judged(point, False, x)
 
@@ -157,7 +156,7 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         return lax.cond(max_displacement(x, neighbours.found_at) > far, again, lambda: (point, neighbours, status, left))
 
     def judged(point, stuck, p):
-        left = jnp.sqrt(jnp.sum(imbalance(problem, point.gradient)) / mass) / STANDARD_GRAVITY
+        left = out_of_balance(point.gradient, problem.mass)
         finite = jnp.isfinite(point.value) & jnp.isfinite(left) & jnp.all(jnp.isfinite(p))
         status = jnp.where(left <= tolerance, CONVERGED, jnp.where(stuck, STALLED, -1))
         return jnp.where(finite, status, NOT_FINITE).astype(jnp.int32), left

@@ -90,7 +90,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
 
 
 def pairs_of(patch: Patch, pairs: Pairs) -> Pairs:
-    """Return those that the patch moves; with `overflow` where they are too many."""
+    """Return the pairs that have a vertex in the patch; `overflow` is set where they are too many."""
     moves = patch.place < SIZE
 
     def some(vertices, most):

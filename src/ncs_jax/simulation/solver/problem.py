@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ncs_jax.energies.contact import self_contact as folds
+from ncs_jax.energies.contact import self_contact
 from ncs_jax.energies.contact.pairs import Pairs, nearby_pairs
 from ncs_jax.energies.contact.safe_steps import free_share, swept_share
 from ncs_jax.energies.contact.self_contact import Repulsion, repulsion
@@ -39,7 +39,6 @@ __all__ = [
     "factor_stiffness",
     "find_neighbours",
     "hold_pins",
-    "imbalance",
     "line_search",
     "max_displacement",
     "refresh_neighbours",
@@ -97,17 +96,17 @@ class Problem:
 
     @property
     def moving(self) -> Float[Array, ""]:
-        """1, or 0 in a static frame."""
+        """Return 1, or 0 in a static frame."""
         return required(self.inputs.moving, "inputs.moving")
 
     @property
     def thickness(self) -> Float[Array, ""]:
-        """How near cloth comes to cloth, m."""
+        """Return how near cloth comes to cloth, m."""
         return required(self.model.material.self_thickness, "material.self_thickness")
 
     @property
     def surface(self) -> Surface:
-        """The touchable body."""
+        """Return the touchable body."""
         return required(self.model.surface, "model.surface")
 
     @property
@@ -122,7 +121,7 @@ class Point(NamedTuple):
     value: Float[Array, ""]  # J
     gradient: Float[Array, "verts 3"]  # N; zero where an exact pin holds
     contact: Contact | None
-    folds: Repulsion | None
+    repulsion: Repulsion | None
 
 
 def dot(a, b):
@@ -208,8 +207,8 @@ def evaluate(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
     if pairs is not None:
         stiff = required(model.material.self_contact, "material.self_contact")
         found = repulsion(x, pairs, problem.thickness)
-        value = value + jnp.where(pairs.overflow, jnp.nan, folds.energy(found, stiff))
-        gradient = gradient + folds.gradient(found, x, stiff)
+        value = value + jnp.where(pairs.overflow, jnp.nan, self_contact.energy(found, stiff))
+        gradient = gradient + self_contact.gradient(found, x, stiff)
     if (free := problem.free) is not None:
         gradient = jnp.where(free[:, None], gradient, 0)
     return Point(value, gradient, contact, found)
@@ -219,12 +218,6 @@ def static_step(model: Model) -> Float[Array, ""]:
     """Return the time step that damps the way to a static state, s."""
     size = jnp.max(jnp.ptp(model.garment.mesh.rest, axis=0))
     return STATIC * jnp.sqrt(jnp.maximum(1, size / TALL))
-
-
-def imbalance(problem: Problem, gradient: Float[Array, "verts 3"]) -> Float[Array, "verts"]:
-    """Return squared out-of-balance forces over mass; none where there is no mass."""
-    mass = problem.mass
-    return jnp.where(mass > 0, jnp.sum(gradient * gradient, axis=-1) / jnp.where(mass > 0, mass, 1), 0)
 
 
 def stiffness_blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point):
@@ -238,9 +231,9 @@ def stiffness_blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point)
     weight = jnp.where(mass > 0, mass, jnp.mean(mass)) / dt**2
     if (free := problem.free) is not None:
         off = jnp.where(jnp.all(free[problem.couplings.pairs], axis=1)[:, None, None], off, 0)
-    if point.folds is not None:
+    if point.repulsion is not None:
         stiff = required(model.material.self_contact, "material.self_contact")
-        diagonal = diagonal + folds.blocks(point.folds, x, stiff)
+        diagonal = diagonal + self_contact.blocks(point.repulsion, x, stiff)
     return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
 
 
