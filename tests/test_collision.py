@@ -247,6 +247,21 @@ def test_distance_to_triangles_and_its_sign(name, rng):
     np.testing.assert_allclose(np.sum(gradient, axis=0) + np.sum(on_body, axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_beyond_the_edge_of_a_thin_wedge_is_outside(first):
+    """An edge's pseudo-normal is of its own two faces: with the base in the place of one of them, it would point inward."""
+    section = np.array([[1, 0], [0, 0.05], [0, -0.05]])
+    vertices = np.array([[*p, z] for z in (0.0, 1.0) for p in section])
+    sides = [[a, b, b + 3, a, b + 3, a + 3] for a, b in ((0, 1), (1, 2), (2, 0))]
+    faces = np.concatenate([np.reshape(sides, (-1, 3)), [[2, 1, 0], [3, 4, 5]]]).astype(np.int32)
+    faces = np.roll(faces, first, axis=1)  # the edge between any two corners of its faces
+    angle, z = (a.ravel() for a in np.meshgrid(np.radians([-60, -20, 0, 20, 60]), [0.2, 0.5, 0.8]))
+    away = np.stack([np.cos(angle), np.sin(angle), 0 * z], axis=-1)
+    x = [1, 0, 0] + 0.03 * away + z[:, None] * [0, 0, 1]
+    d, *_ = exact_distance(jnp.asarray(x), jnp.asarray(vertices), surface_from(x, vertices, faces))
+    np.testing.assert_allclose(d, 0.03, atol=1e-12)
+
+
 def test_a_face_normal_alone_would_get_the_sign_wrong():
     """Beside the tip of a thin spike: the nearest faces disagree, so the test above is not passed by luck."""
     vertices, faces = ball(1)

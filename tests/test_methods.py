@@ -52,10 +52,12 @@ def test_a_window_that_reaches_back_to_the_start_is_the_motion(method):
     assembly, params, motion = ready(method=method)
     track, ends = features_from_records(assembly.model, motion), jnp.array([5, 9], jnp.int32)
     whole = codes_of(assembly.network, params, assembly.model, track)
-    for of_all, of_windows in zip(whole, windows_to(assembly.network, params, track, ends, 10, 3), strict=True):
-        assert (of_all is None) == (of_windows is None)
-        if of_all is not None:
-            np.testing.assert_allclose(of_windows[:, 1], of_all[7:10], rtol=0, atol=1e-13)
+    for count in (1, 8):  # few windows, and more frames in them than the motion has
+        found = windows_to(assembly.network, params, track, jnp.tile(ends, count), 10, 3)
+        for of_all, of_windows in zip(whole, found, strict=True):
+            assert (of_all is None) == (of_windows is None)
+            if of_all is not None:
+                np.testing.assert_allclose(of_windows[:, 1], of_all[7:10], rtol=0, atol=1e-13)
     # one that would begin before the motion holds its first frame still: no motion yet
     if method != "snug":  # whose state is not at rest there
         found = windows_to(assembly.network, params, track, ends, 10, 3)[0][:, 0]

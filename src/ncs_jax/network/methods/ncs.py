@@ -95,7 +95,7 @@ class NCS(FromCodes):
                 rest = jnp.zeros(self.state, every.dtype)
                 states = jnp.asarray(self.dynamic.apply(variables, every, rest, begins, method="of_motions"))
                 return Codes(fixed, jnp.where(begun[length - last :, :, None], states[inside[length - last :]], 0))
-            pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None]
+            pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None].astype(every.dtype)
             features = jnp.einsum("lbf,fg->lbg", pick, every)
         else:
             moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
