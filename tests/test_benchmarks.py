@@ -62,13 +62,6 @@ def test_training(tmp_path, capsys):
     assert "no such folder" in capsys.readouterr().err
 
 
-def test_training_of_a_network_that_tells_the_motions_something(tmp_path):
-    text = FREE.replace("[network]", '[network]\ncell = "swing"').replace("[garment]", '[garment]\npins = "pins"')
-    assembly = training.ready(load_scene(write_scene(tmp_path, text)))
-    swing = assembly.track.swing
-    assert swing.shape == (len(assembly.track.start), assembly.network.modes) and np.isfinite(swing).all()
-
-
 def _fresh(folder, text=SCENE):
     assembly = assemble(load_scene(write_scene(folder, text)))
     ends = np.arange(min(4, len(assembly.track.start)), dtype=np.int32)
@@ -78,22 +71,25 @@ def _fresh(folder, text=SCENE):
 EVERY = SCENE + '[physics.collision]\nfriction = 0.3\ndistance = "smooth"\n[physics.self_contact]\nstiffness = 20\n'
 STILL = SCENE.replace('files = ["swing.npz"]', "files = []").replace('validation = ["swing.npz"]', "")
 
+SWINGING = FREE.replace("[network]", '[network]\ncell = "swing"').replace("[garment]", '[garment]\npins = "pins"')
+
 
 @pytest.mark.parametrize(
     ("text", "there"),
     [
         (EVERY.replace("smoothing = 2", 'smoothing = 2\npins = "pins"'), {"friction", "pinning", "self_contact"}),
         (STILL, {"network", "contact query"}),
+        (SWINGING, {"network", "membrane"}),
     ],
 )
 def test_training_with_other_terms(tmp_path, text, there):
-    """Every part can be traced, its derivative too."""
-    assembly, _, ends = _fresh(tmp_path, text)
-    state = initial_state(assembly.model, assembly.network, 0)
+    """Every part can be traced, its derivative too. A swing is told to the motions, and inertia is its own."""
+    assembly = training.ready(load_scene(write_scene(tmp_path, text)))
+    state, ends = initial_state(assembly.model, assembly.network, 0), np.zeros(1, np.int32)
     parts = training.parts(assembly, state, jnp.asarray(ends), jnp.zeros_like(ends))
     for function, *arguments in parts.values():
         jax.eval_shape(lambda *a, f=function: jax.tree.leaves(f(*a)), *arguments)
-    assert there <= set(parts) and ("inertia" in parts) == (text != STILL)
+    assert there <= set(parts) and ("inertia" in parts) == (text not in (STILL, SWINGING))
 
 
 def test_the_work_of_a_network_is_that_of_its_products(tmp_path):
