@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, transforms
 from ncs_jax.io import MotionRecord
@@ -18,7 +19,7 @@ from ncs_jax.metrics.quality import measure
 from ncs_jax.network.methods.method import initial_parameters
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import features_from_records
-from ncs_jax.prepare.motion_import import mirror_partners
+from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.features import input_joints, mirror, motion_features
 from ncs_jax.scene.spec import load_scene
@@ -107,27 +108,55 @@ def test_a_pose_in_axes_of_its_joint_is_mirrored_in_the_world(rng):
     assert np.abs(mirror(own(poses), translation, PARTNER)[0] - found[0]).max() > 0.1
 
 
-@pytest.mark.parametrize(
-    ("left", "right"),
-    [
-        *(("thigh_l", "thigh_r"), ("UpLeg.L", "UpLeg.R"), ("Bip01 L Thigh", "Bip01 R Thigh"), ("lHip", "rHip")),
-        *(
-            ("mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"),
-            ("left_hip", "right_hip"),
-            ("L_Hip", "R_Hip"),
-            ("lThumb1", "rThumb1"),
-        ),
-    ],
-)
-def test_sides_are_told_by_the_names_of_many_tools(left, right):
-    joints = np.array([[0, 1, 0], [0.1, 0.9, 0], [0.5, 0.9, 0]])  # by place neither has a partner
-    np.testing.assert_array_equal(mirror_partners(("Hips", left, right), joints), [0, 2, 1])
+SIDES = {  # names of the skeleton above, as tools write them
+    "SMPL": ("pelvis", "left_hip", "right_hip", "spine1", "left_shoulder", "right_shoulder", "left_wrist", "right_wrist"),
+    "SMPL's other": ("Pelvis", "L_Hip", "R_Hip", "Spine1", "L_Shoulder", "R_Shoulder", "L_Hand", "R_Hand"),
+    "CMU": ("Hips", "lHip", "rHip", "Spine", "lShldr", "rShldr", "lHand", "rHand"),
+    "Mixamo": tuple(f"mixamorig:{n}" for n in
+                    ("Hips", "LeftUpLeg", "RightUpLeg", "Spine", "LeftArm", "RightArm", "LeftHand", "RightHand")),
+    "Unreal": ("pelvis", "thigh_l", "thigh_r", "spine_01", "upperarm_l", "upperarm_r", "hand_l", "hand_r"),
+    "Blender": ("Hips", "UpLeg.L", "UpLeg.R", "Spine", "Arm.L", "Arm.R", "Hand.L", "Hand.R"),
+    "Blender, one side copied": ("Hips", "UpLeg.L", "UpLeg.R.001", "Spine", "Arm.L", "Arm.R.001", "Hand.L", "Hand.R.001"),
+    "Biped": tuple(f"Bip01 {n}" for n in
+                   ("Pelvis", "L Thigh", "R Thigh", "Spine", "L UpperArm", "R UpperArm", "L Hand", "R Hand")),
+    "MMD in Blender": ("センター", "足.L", "足.R", "上半身", "腕.L", "腕.R", "手首.L", "手首.R"),
+    "MMD": ("センター", "左足", "右足", "上半身", "左腕", "右腕", "左手首", "右手首"),
+    "a mark in what all share": tuple(f"Char_L01_{n}" for n in
+                                      ("Hips", "Leg_L", "Leg_R", "Spine", "Arm_L", "Arm_R", "Hand_L", "Hand_R")),
+    "one pair told": ("root", "lf_leg", "rt_leg", "spine", "lf_arm", "rt_arm", "thumb_L", "thumb_R"),
+    "three alike in the middle": ("Spine", "leg_l", "leg_r", "spine_", "arm_l", "arm_r", "hand_l", "hand_r"),
+    "numbers": tuple(f"bone_{i}" for i in range(8)),
+    "none": (),
+}  # fmt: skip
 
 
-def test_sides_without_names_are_told_by_places():
-    joints = np.array([[0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0]])
-    for names in ((), ("Bone", "Bone.001", "Bone.002")):
-        np.testing.assert_array_equal(mirror_partners(names, joints), [0, 2, 1])
+@pytest.mark.parametrize("names", SIDES)
+@pytest.mark.parametrize(("turn", "axis"), [(0, 0), (90, 2), (180, 0)])
+def test_partners_of_a_body_that_stands_anywhere(names, turn, axis):
+    """By the names of many tools or by places alone, beside the origin, and facing another way."""
+    joints = Rotation.from_euler("y", turn, degrees=True).apply(JOINTS) + [0.7, 0, -0.4]
+    partner, across = mirror_partners(SIDES[names], joints, PARENTS)
+    np.testing.assert_array_equal(partner, PARTNER)
+    assert across == axis
+
+
+def test_limbs_that_begin_at_one_place_are_told_apart_by_what_hangs_on_them():
+    """As in CMU's skeletons, whose hip joints lie in the hips, and in rigs that hold every bone twice."""
+    parents = (-1, 0, 0, 0, 1, 2, 3, 4, 5)
+    x = np.array([0, 0, 0, 0, 0.1, -0.1, 0, 0.1, -0.1])
+    joints = np.stack([x, [1, 1, 1, 1, 0.9, 0.9, 1.2, 0.5, 0.5], 0 * x], axis=1)
+    partner, _ = mirror_partners((), joints, parents)
+    np.testing.assert_array_equal(partner, [0, 2, 1, 3, 5, 4, 6, 8, 7])
+    twice = (-1, 0, 0, 0, 0)
+    names = ("hips", "ORG-thigh.L", "ORG-thigh.R", "DEF-thigh.L", "DEF-thigh.R")
+    joints = np.array([[0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0]])
+    np.testing.assert_array_equal(mirror_partners(names, joints, twice)[0], [0, 2, 1, 4, 3])
+
+
+def test_a_skeleton_without_two_sides_is_refused():
+    joints = np.array([[0, 1, 0], [0.3, 0.9, 0.2], [0.1, 0.5, -0.3], [-0.4, 1.5, 0.1]])
+    with pytest.raises(InputError, match=r"motion\.mirror: a skeleton that is the same on both sides expected .found .joint"):
+        mirror_partners(("r", "a", "b", "c"), joints, (-1, 0, 1, 0))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

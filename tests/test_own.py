@@ -15,7 +15,8 @@ import pytest
 import ncs_jax
 from ncs_jax import InputError
 from ncs_jax.cli import main
-from ncs_jax.energies.terms import MEASURED, NAMES, Terms
+from ncs_jax.energies.terms import MEASURED, NAMES, StepInputs, Terms
+from ncs_jax.energies.total import energies
 from ncs_jax.metrics.motion import MEASURES
 from ncs_jax.metrics.quality import QUANTITIES
 from ncs_jax.network.methods.choose import network_from
@@ -66,7 +67,9 @@ def trained(folder):
         return ncs_jax.train(scene(folder), folder / "run", steps=20, terms=[push, hook])
 
 
-@pytest.mark.parametrize("name", ["membrane", "total", "strain", "speed", "out_of_balance", "push", "no name"])
+@pytest.mark.parametrize(
+    "name", ["membrane", "total", "strain", "speed", "out_of_balance", "validation_total", "push", "no name"]
+)
 def test_a_term_is_refused_whose_name_is_taken(name):
     def mine(x, step):
         return jnp.sum(x)
@@ -74,6 +77,17 @@ def test_a_term_is_refused_whose_name_is_taken(name):
     mine.__name__ = name
     with pytest.raises(ValueError, match=f"no other term or measure has, not '{name}'"):
         Terms(own=(push, mine))
+
+
+@pytest.mark.parametrize("value", [None, {}, "x", jnp.zeros(3), jnp.zeros((1,))], ids=["None", "dict", "str", "3", "1"])
+def test_a_term_that_returns_no_energy_is_named(trained, value):
+    def mine(x, step):
+        return value
+
+    model = trained.assembly.model
+    alone = Terms(None, bending=False, collision=None, gravity=False, inertia=False, own=(mine,))
+    with pytest.raises(InputError, match="terms: mine: a scalar expected, the energy in J"):
+        energies(model.garment.mesh.rest, model.garment, model.material, StepInputs(), alone)
 
 
 def test_terms_are_logged_and_measured_by_their_names(folder, trained, plain_jax):

@@ -30,8 +30,10 @@ def simulate(options) -> int:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ncs_jax import io
+    from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs import simulate as runs_simulate
 
+    animation_suffix(options.out)  # before hours are spent on frames that cannot be written
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), TimeElapsedColumn())

@@ -95,7 +95,7 @@ class Terms:
         taken = {*NAMES, *MEASURED}
         for term in self.own:
             name = getattr(term, "__name__", "")
-            if not name.isidentifier() or name in taken:
+            if not name.isidentifier() or name in taken or name.startswith("validation_"):
                 raise ValueError(f"a term of one's own needs a __name__ that no other term or measure has, not {name!r}")
             taken.add(name)
 

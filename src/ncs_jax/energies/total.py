@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -20,7 +21,7 @@ from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
-from ncs_jax.errors import required
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import unpose
 
 __all__ = ["body_collision", "contact_force", "distances", "energies", "total"]
@@ -126,6 +127,7 @@ def energies(
     for term in terms.own:
         with jax.named_scope(term.__name__):
             parts[term.__name__] = term(x, step)
+            _check_energy(term.__name__, parts[term.__name__])
     if step.force is not None:
         with jax.named_scope("external"):
             parts["external"] = -jnp.sum(step.force * x, axis=(0, 1))
@@ -138,6 +140,13 @@ def energies(
         with jax.named_scope("self_contact"):
             parts["self_contact"] = _self_contact(x, garment, material)
     return parts
+
+
+def _check_energy(name: str, value: object) -> None:
+    """Raise an InputError unless what a term of one's own returned is a scalar."""
+    if not isinstance(value, int | float | np.generic | np.ndarray | jax.Array) or jnp.shape(value) != ():
+        found = type(value).__name__ if value is None or not hasattr(value, "shape") else f"an array of shape {value.shape}"
+        raise InputError("a scalar expected, the energy in J", field=f"terms: {name}", value=found, mend="sum it")
 
 
 def total(*arguments, **options) -> Float[Array, ""]:

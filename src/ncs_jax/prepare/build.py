@@ -19,8 +19,10 @@ from ncs_jax.network.methods.method import Method
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.constants import model_from
 from ncs_jax.prepare.garment_checks import check_on_body
-from ncs_jax.prepare.motion_import import load_motion, mirror_partners
+from ncs_jax.prepare.mirroring import mirror_partners
+from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
+from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
@@ -172,9 +174,14 @@ def _training_features(files: SceneFiles, model: Model, motions: list[io.MotionR
         joints = 1 if body is None else len(body.parents)
         motions = [io.MotionRecord(np.zeros((1, joints, 3), np.float32), np.zeros((1, 3), np.float32), model.fps, ())]
     elif files.scene.motion.mirror and body is not None:
-        partner, axes = mirror_partners(body.joint_names, body.joints), body.rest_rotations
+        try:
+            partner, axis = mirror_partners(body_names(body), body.joints, body.parents)
+        except InputError as error:
+            raise InputError(
+                error.expected, file=files.scene.source, field=error.field, value=error.value, mend=error.mend
+            ) from None
         for r in motions[:]:
-            poses, translation = mirror(r.poses, r.translation, partner, axes=axes)
+            poses, translation = mirror(r.poses, r.translation, partner, axis, body.rest_rotations)
             motions = [*motions, io.MotionRecord(poses, translation, r.fps, r.joint_names)]
     return features_from_records(model, *motions)
 

@@ -13,11 +13,10 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
-from ncs_jax.prepare.joint_names import side_and_rest
 from ncs_jax.prepare.retarget import body_names, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.scene.spec import MotionSpec, Scene, packaged
 
-__all__ = ["lead_in_frames", "load_motion", "mirror_partners", "retarget_to_body"]
+__all__ = ["lead_in_frames", "load_motion", "retarget_to_body"]
 
 JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
 
@@ -162,14 +161,3 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         )
         translation = begin + np.asarray(moved)
     return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=scene.motion.fps)
-
-
-def mirror_partners(names: tuple[str, ...], joints: np.ndarray) -> np.ndarray:
-    """Return each joint's partner on the other side: by names of left and right, else by mirrored rest places (x to -x)."""
-    told = [side_and_rest(name) for name in names]
-    if any(side for side, _ in told):
-        place = {one: i for i, one in reversed(list(enumerate(told)))}  # the first of equal names
-        other = {"left": "right", "right": "left", "": ""}
-        return np.array([place.get((other[side], rest), i) for i, (side, rest) in enumerate(told)])
-    mirrored = joints * [-1, 1, 1]
-    return np.linalg.norm(joints[None] - mirrored[:, None], axis=-1).argmin(axis=1)

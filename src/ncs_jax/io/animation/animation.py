@@ -20,7 +20,7 @@ from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices
 
-__all__ = ["read_animation", "write_animation"]
+__all__ = ["animation_suffix", "read_animation", "write_animation"]
 
 FIELDS = ("vertices", "faces", "fps")
 READABLE = (".npz", ".h5", ".hdf5", ".pc2", ".mdd", *USD)
@@ -52,10 +52,7 @@ def write_animation(
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
             file cannot be written.
     """
-    file = Path(path)
-    suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
-    if suffix and suffix not in FORMATS:
-        raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+    file, suffix = Path(path), animation_suffix(path)
     if worn_by is not None and suffix != ".glb":
         raise InputError(".glb expected, as no other format here holds a body", file=file, value=suffix or "a folder")
     x = floats(file, "vertices", np.asarray(vertices), ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
@@ -64,8 +61,6 @@ def write_animation(
         raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)
     if not 0 < float(fps) < np.inf:
         raise InputError("a number above 0 expected", file=file, field="fps", value=fps)
-    if suffix and file.expanduser().is_dir():
-        raise InputError("a file expected", file=file, value="a folder", mend="give another name")
     if suffix == ".npz":
         write_npz(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     elif suffix == ".pc2":
@@ -81,6 +76,21 @@ def write_animation(
         write_hdf5(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     else:
         _write_folder(file, x, triangles, float(fps))
+
+
+def animation_suffix(path: str | Path) -> str:
+    """Return the suffix of a file that an animation can be written to, or nothing for a folder.
+
+    Raises:
+        InputError: no such format is written, or a folder stands where the file shall be.
+    """
+    file = Path(path)
+    suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
+    if suffix and suffix not in FORMATS:
+        raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+    if suffix and file.expanduser().is_dir():
+        raise InputError("a file expected", file=file, value="a folder", mend="give another name")
+    return suffix
 
 
 def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: float) -> None:
