@@ -17,7 +17,7 @@ DESCRIPTION = """\
 Neural cloth simulation: a garment learns to move on an animated character from physics alone.
 
   ncs demo                          train the packaged T-shirt and write a preview to look at
-  ncs train SCENE --out RUN         train the garment of a scene file (ncs:tshirt and ncs:skirt come with the package)
+  ncs train SCENE --out RUN         train the garment of a scene file (ncs:demo, ncs:tshirt and ncs:skirt are packaged)
   ncs animate RUN --out FILE        animate a trained garment
   ncs export RUN --out FILE         write its step for a game engine or another host, as ONNX or StableHLO
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame

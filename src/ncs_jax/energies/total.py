@@ -20,7 +20,7 @@ from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.gravity import gravity
 from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.pinning import pinning
-from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
+from ncs_jax.energies.terms import MEMBRANES, Garment, Material, OwnTerm, StepInputs, Terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import unpose
 
@@ -126,8 +126,7 @@ def energies(
             parts["pinning"] = pinning(unposed, mesh.rest[pins], material.pinning)
     for term in terms.own:
         with jax.named_scope(term.__name__):
-            parts[term.__name__] = term(x, step)
-            _check_energy(term.__name__, parts[term.__name__])
+            parts[term.__name__] = _own_energy(term, x, step)
     if step.force is not None:
         with jax.named_scope("external"):
             parts["external"] = -jnp.sum(step.force * x, axis=(0, 1))
@@ -142,11 +141,13 @@ def energies(
     return parts
 
 
-def _check_energy(name: str, value: object) -> None:
-    """Raise an InputError unless what a term of one's own returned is a scalar."""
+def _own_energy(term: OwnTerm, x, step: StepInputs):
+    """Return the energy by a term of one's own, J, after a check that it is a scalar."""
+    value = term(x, step)
     if not isinstance(value, int | float | np.generic | np.ndarray | jax.Array) or jnp.shape(value) != ():
         found = type(value).__name__ if value is None or not hasattr(value, "shape") else f"an array of shape {value.shape}"
-        raise InputError("a scalar expected, the energy in J", field=f"terms: {name}", value=found, mend="sum it")
+        raise InputError("a scalar expected, the energy in J", field=f"terms: {term.__name__}", value=found, mend="sum it")
+    return value
 
 
 def total(*arguments, **options) -> Float[Array, ""]:

@@ -40,7 +40,7 @@ class Exported:
         if "usable_until" in self.facts:
             text += f"usable until {self.facts['usable_until']}: {self.facts['usable_until_means']}\n  "
         if self.check is None:
-            return text + "not checked: that takes a motion, and of an ONNX file the package onnxruntime"
+            return text + "not checked: that takes a motion (--motion FILE) and, of an ONNX file, pip install onnxruntime"
         difference, milliseconds, frames, error = self.check
         text += (
             f"{frames} frames, {milliseconds:.2g} ms each; at most {difference:.1e} m from the network that it was made from"
