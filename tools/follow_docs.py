@@ -202,15 +202,11 @@ def _simulated(rest: list[str]) -> str:
     """Simulate a few frames; where the page names a motion and goes on with all of it, an animation stands in for the file."""
     from ncs_jax.cli import main
 
-    motion, out = ([rest[rest.index(name) + 1]] if name in rest else [] for name in ("--motion", "--out"))
-    named = out and out[0] != NAMES["FILE"]
-    code = main(["simulate", "short.toml", "--out", "few.npz"])
-    if code == 0 and named:
-        other = rest[1] != "ncs:tshirt" or not motion or not Path("runs/tshirt").exists()
-        if other:
-            shutil.copy("few.npz", out[0])
-        else:
-            code = main(["animate", "runs/tshirt", "--motion", motion[0], "--out", out[0]])
+    out = rest[rest.index("--out") + 1]
+    out = "out.npz" if out == NAMES["FILE"] else out
+    code = main(["simulate", "short.toml", "--out", out])
+    if code == 0 and "--motion" in rest and rest[1] == "ncs:tshirt" and Path("runs/tshirt").exists():
+        code = main(["animate", "runs/tshirt", "--motion", rest[rest.index("--motion") + 1], "--out", out])
     return "" if code == 0 else "exit code 2"
 
 

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ncs_jax.geometry.degenerate import LINE, relative_heights
 from ncs_jax.geometry.numerics import least_length, norm
 from ncs_jax.geometry.soa_vectors import Vector, cross, dot, length, minus, plus, times
 
 __all__ = [
+    "LINE",
     "Mesh",
     "Rings",
     "adjacency",
@@ -23,11 +23,14 @@ __all__ = [
     "edge_strain",
     "material_axes",
     "mesh_from",
+    "relative_heights",
     "spread",
     "topology",
     "vertex_rings",
     "with_middles",
 ]
+
+LINE = 2e-6  # rest height of a face, of its longest edge, up to which it is a line: float32 positions resolve no more
 
 
 @jax.tree_util.register_dataclass
@@ -54,7 +57,7 @@ class Rings:
 class Mesh:
     """A garment's rest state. Lengths in m, areas in m^2, angles in rad; elements of zero rest area weigh nothing.
 
-    A face has zero rest area if its height is at most `degenerate.LINE` times its longest edge.
+    A face has zero rest area if its height is at most `LINE` times its longest edge.
 
     A hinge is an edge between two faces: its vertices are the two ends, then the opposite vertex of each face.
     """
@@ -283,6 +286,14 @@ def vertex_rings(faces: np.ndarray, verts: int) -> np.ndarray:
     """Return the faces around each vertex (verts, most), padded with len(faces): a gather over them replaces a scatter."""
     places = _places(np.asarray(faces), verts)
     return np.where(places < 3 * len(faces), places % max(len(faces), 1), len(faces)).astype(np.int32)
+
+
+def relative_heights(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the height of each triangle (F,) over its longest edge, as a share of that edge; 0 where all corners coincide."""
+    a, b, c = (x[faces[:, k]].astype(np.float64) for k in range(3))
+    double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    return double / np.where(longest > 0, longest, 1)
 
 
 def edge_strain(x: Float[Array, "verts 3"], mesh: Mesh) -> Float[Array, "edges"]:

@@ -180,9 +180,9 @@ def _training_features(files: SceneFiles, model: Model, motions: list[io.MotionR
             raise InputError(
                 error.expected, file=files.scene.source, field=error.field, value=error.value, mend=error.mend
             ) from None
-        for r in motions[:]:
-            poses, translation = mirror(r.poses, r.translation, partner, axis, body.rest_rotations)
-            motions = [*motions, io.MotionRecord(poses, translation, r.fps, r.joint_names)]
+        given = partner, axis, body.rest_rotations
+        mirrored = [io.MotionRecord(*mirror(r.poses, r.translation, *given), r.fps, r.joint_names) for r in motions]
+        motions = motions + mirrored
     return features_from_records(model, *motions)
 
 

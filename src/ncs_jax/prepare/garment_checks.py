@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.degenerate import LINE, relative_heights
+from ncs_jax.geometry.mesh import LINE, relative_heights
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord

@@ -16,7 +16,7 @@ import numpy as np
 from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
-from ncs_jax.geometry.degenerate import LINE, relative_heights
+from ncs_jax.geometry.mesh import LINE, relative_heights
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.build import Assembly, features_from_records
 from ncs_jax.scene.model import Model, local_rotations, pose_body, pose_rest
