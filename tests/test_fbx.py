@@ -201,19 +201,90 @@ def test_pivots_orders_and_inherited_scales(tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-TREES = {
-    "stretch": ({"stretch": 2.0}, "joint Head: bones of fixed length"),
-    "layers": ({"layers": 2}, "one layer of animation"),
+def test_bones_that_stretch_are_refused(tmp_path):
+    (tmp_path / "hero.fbx").write_bytes(fbx.binary(Hero("Y up, cm").tree(stretch=2.0)))
+    with pytest.raises(InputError, match="joint Head: bones of fixed length") as caught:
+        io.read_motion(tmp_path / "hero.fbx")
+    assert str(tmp_path / "hero.fbx") in str(caught.value)
+
+
+def take(name: str, number: int, values: list[float], *, empty: bool = False) -> tuple[list, list]:
+    """A take that turns the first joint about x, and its links; with `empty`, a layer without curves."""
+    stack, layer, node, curve = (1000 * number + k for k in range(4))
+    objects = [
+        ("AnimationStack", [stack, f"AnimStack::{name}", ""], []),
+        ("AnimationLayer", [layer, "AnimLayer::Base", ""], []),
+    ]
+    links = [fbx.link(layer, stack)]
+    if not empty:
+        objects += [
+            ("AnimationCurveNode", [node, "AnimCurveNode::R", ""], []),
+            fbx.curve(curve, np.arange(len(values)) / 30, np.array(values)),
+        ]
+        links += [fbx.link(node, layer), fbx.link(node, 20, "Lcl Rotation"), fbx.link(curve, node, "d|X")]
+    return objects, links
+
+
+TAKES = {  # takes before the hero's own, which is called Take 1; the take that is read, and the others that could be
+    "Mixamo": ([("Take 001", [], True)], "Take 1", None),
+    "two empty ones": ([("Take 001", [], True), ("mixamo.com", [], True)], "Take 1", None),
+    "one that stands still": ([("T-Pose", [30.0, 30.0, 30.0], False)], "Take 1", "T-Pose"),
+    "Blender": ([("Armature|Action", [0.0, 40.0, 80.0], False)], "Armature|Action", "Take 1"),
+    "Japanese": ([("歩く", [0.0, 40.0, 80.0], False), ("Take 001", [], True)], "歩く", "Take 1"),
 }
 
 
-@pytest.mark.parametrize("case", TREES)
-def test_motions_that_are_refused(tmp_path, case):
-    change, message = TREES[case]
-    (tmp_path / "hero.fbx").write_bytes(fbx.binary(Hero("Y up, cm").tree(**change)))
-    with pytest.raises(InputError, match=message) as caught:
-        io.read_motion(tmp_path / "hero.fbx")
-    assert str(tmp_path / "hero.fbx") in str(caught.value)
+@pytest.mark.parametrize("case", TAKES)
+@pytest.mark.parametrize("writer", ["text", "binary"])
+def test_the_first_take_that_moves_is_read(tmp_path, case, writer):
+    before, chosen, others = TAKES[case]
+    tree = Hero("Y up, cm").tree()
+    parts = {record[0]: record for record in tree}
+    for number, (name, values, empty) in enumerate(before, 1):
+        objects, links = take(name, number, values, empty=empty)
+        parts["Objects"][2][:0] = objects
+        parts["Connections"][2][:0] = links
+    path = tmp_path / "hero.fbx"
+    path.write_bytes(WRITERS[writer](tree))
+    found = io.read_motion(path)
+    np.testing.assert_array_equal(found.poses, io.read_motion(f"{path}#{chosen}").poses)
+    assert len(found.poses) == (FRAMES if chosen == "Take 1" else 3)
+    note = f"its animation {chosen} is read; FILE#NAME reads another: {others}"
+    assert found.notes == ((note,) if others else ())
+    with pytest.raises(InputError, match=r"no such animation .found 'run'.; .*Take 1"):
+        io.read_motion(f"{path}#run")
+    if before[0][2]:
+        with pytest.raises(InputError, match="curves of some joint expected"):
+            io.read_motion(f"{path}#{before[0][0]}")
+
+
+def test_of_several_layers_the_first_counts_and_is_told(tmp_path):
+    (tmp_path / "one.fbx").write_bytes(fbx.binary(Hero("Y up, cm").tree()))
+    (tmp_path / "two.fbx").write_bytes(fbx.binary(Hero("Y up, cm").tree(layers=2)))
+    found = io.read_motion(tmp_path / "two.fbx")
+    np.testing.assert_array_equal(found.poses, io.read_motion(tmp_path / "one.fbx").poses)
+    assert found.notes == ("of its layers (Base, Base) the first that moves a joint counts; bake them to have all",)
+
+
+def test_polygons_are_cut_as_in_every_mesh(tmp_path):
+    """A quad that is not convex is cut along its inner diagonal, and an edge of two corners is no polygon."""
+    tree = Hero("Y up, cm").tree()
+    objects = next(inner for name, _, inner in tree if name == "Objects")
+    mesh = next(inner for name, _, inner in objects if name == "Geometry")
+    cluster = next(inner for name, values, inner in objects if name == "Deformer" and values[2] == "Cluster")
+    count, faces = len(mesh[0][1][0]) // 3, len(mesh[1][1][0]) // 3
+    dart = np.array([[4.0, 0, 0], [1, 1, 0], [0, 4, 0], [0, 0, 0]])
+    mesh[0][1][0] = np.concatenate([mesh[0][1][0], dart.ravel()])
+    corners = np.array([count, count + 1, count + 2, -1 - (count + 3), 0, -2], np.int32)
+    mesh[1][1][0] = np.concatenate([mesh[1][1][0], corners])
+    cluster[0][1][0] = np.concatenate([cluster[0][1][0], np.arange(count, count + 4, dtype=np.int32)])
+    cluster[1][1][0] = np.concatenate([cluster[1][1][0], np.ones(4)])
+    (tmp_path / "hero.fbx").write_bytes(fbx.binary(tree))
+    body = io.read_body(tmp_path / "hero.fbx")
+    assert len(body.faces) == faces + 2
+    p = body.vertices[body.faces[-2:]]
+    area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    np.testing.assert_allclose(area[0], area[1], rtol=1e-9)  # cut along the outer diagonal they would be 4 and 8
 
 
 TEXT = fbx.text(Hero("Y up, cm").tree()).decode()

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.character.quaternions import from_axis_angle
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
@@ -187,7 +187,7 @@ def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int
     """Add the body: its skin, joints and their movement. The joints' axes are the world's at rest, as in `skinning.forward`."""
     count, joints = body.weights.shape
     poses = motion.poses if body.rest_rotations is None else np.einsum("jab,tjb->tja", body.rest_rotations, motion.poses)
-    turns = np.roll(from_axis_angle(poses), -1, axis=-1).astype("<f4")  # x y z w
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4).astype("<f4")  # x y z w
     bones = body.joints - np.where(body.parents[:, None] >= 0, body.joints[body.parents], 0)
     path = (bones[0] + motion.translation).astype("<f4")
 

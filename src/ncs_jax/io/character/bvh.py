@@ -1,16 +1,17 @@
-"""Biovision hierarchies (.bvh): a skeleton and its motion as text."""
+"""Biovision hierarchies (.bvh): a skeleton and its motion as text, as the tools write it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.character.quaternions import about_axis, multiply, to_axis_angle
+from ncs_jax.io.character.bvh_motion import read_values, without_comments
 from ncs_jax.io.tables.files import text_of
 
 __all__ = ["Bvh", "read_bvh"]
@@ -26,7 +27,8 @@ class Bvh:
         file: the path. joint_names: J names, root first; end sites are no joints. parents: (J,) int32, -1 for the root.
         offsets: (J, 3) from each joint's parent to the joint in the rest pose; the root's is its rest place.
         tips: (J, 3) from a joint to its end site; NaN where a joint has none. poses: (T, J, 3) local rotations since rest, axis
-            times angle. positions: (T, 3) of the root. fps: frames per second.
+            times angle. positions: (T, 3) of the root. fps: frames per second. notes: where the file is not as it should be,
+            and how it was read.
     """
 
     file: Path
@@ -37,70 +39,104 @@ class Bvh:
     poses: np.ndarray
     positions: np.ndarray
     fps: float
+    notes: tuple[str, ...] = ()
 
 
-def read_bvh(path: str | Path) -> Bvh:
+@dataclass(eq=False)
+class _Joint:
+    """A joint as it is written: `column` is where its channels, (kind, axis), begin in a frame; `tip` is its end site's."""
+
+    name: str
+    parent: int
+    column: int
+    offset: list[float] = field(default_factory=list)
+    tip: list[float] = field(default_factory=lambda: [np.nan] * 3)
+    channels: list[tuple[str, int]] = field(default_factory=list)
+
+
+def read_bvh(path: str | Path, root: str = "") -> Bvh:
     """Read a skeleton with its motion. Channels may stand in any order: R = R_first R_second R_third.
 
-    A number that is not finite stays so: the caller checks the frames that it uses.
+    Of several skeletons in one file, the one with the most joints is read, or the one whose ROOT is named. A number that is not
+    finite stays so: the caller checks the frames that it uses.
     """
     file, text = text_of(path)
-    parts = re.split(r"^\s*MOTION\s*$", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
+    parts = re.split(r"^\s*MOTION\s*:?\s*?(?:(?:#|//|;).*)?$", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
     if len(parts) != 2:
         raise InputError("HIERARCHY and then MOTION expected", file=file, field="MOTION", mend="export the .bvh again")
-    names, parents, offsets, tips, channels = _hierarchy(file, parts[0])
-    values, fps = _motion(file, parts[1], sum(map(len, channels)))
-    poses = np.zeros((len(values), len(names), 3))
+    every = _hierarchy(file, parts[0])
+    labels = [f"{'XYZ'[axis]}{kind} of {joint.name}" for joint in every for kind, axis in joint.channels]
+    values, fps, notes = read_values(file, parts[1], labels)
+    joints, note = _one_skeleton(file, every, root)
+    offsets = np.array([joint.offset for joint in joints])
+    poses = np.zeros((len(values), len(joints), 3))
     positions = np.broadcast_to(offsets[0], (len(values), 3)).copy()
-    column = 0
-    with np.errstate(all="ignore"):
-        for j, joint in enumerate(channels):
-            own = values[:, column : column + len(joint)]
-            column += len(joint)
-            turn = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(values), 4))
-            for (kind, axis), value in zip(joint, own.T, strict=True):
-                if kind == "rotation":
-                    turn = multiply(turn, about_axis(axis, np.radians(value)))
-                elif j == 0:
-                    positions[:, axis] = value
-                elif np.ptp(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
-                    raise InputError(
-                        "bones of fixed length expected", file=file, field=f"joint {names[j]}",
-                        value=f"its {'XYZ'[axis]}position varies by {np.ptp(value):.3g}",
-                        mend="export positions for the root only",
-                    )  # fmt: skip
-            poses[:, j] = to_axis_angle(turn)
-    return Bvh(file, tuple(names), np.array(parents, np.int32), offsets, tips, poses, positions, fps)
+    for j, joint in enumerate(joints):
+        own = values[:, joint.column : joint.column + len(joint.channels)]
+        turn = Rotation.identity(len(values))
+        for (kind, axis), value in zip(joint.channels, own.T, strict=True):
+            if kind == "rotation":
+                angle = np.where(np.isfinite(value), value, 0)
+                turn = turn * Rotation.from_euler("xyz"[axis], angle[:, None], degrees=True)
+                poses[~np.isfinite(value), j] = np.nan
+            elif j == 0:
+                positions[:, axis] = value
+            elif np.ptp(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
+                raise InputError(
+                    "bones of fixed length expected", file=file, field=f"joint {joint.name}",
+                    value=f"its {'XYZ'[axis]}position varies by {np.ptp(value):.3g}",
+                    mend="export positions for the root only",
+                )  # fmt: skip
+        poses[:, j] += turn.as_rotvec()
+    return Bvh(
+        file, tuple(joint.name for joint in joints), np.array([joint.parent for joint in joints], np.int32), offsets,
+        np.array([joint.tip for joint in joints]), poses, positions, fps, (*note, *notes),
+    )  # fmt: skip
 
 
-def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray, np.ndarray, list[list[tuple[str, int]]]]:
-    """Return names, parents, offsets, tips and channels of the joints."""
-    names: list[str] = []
-    parents: list[int] = []
-    offsets: list[list[float]] = []
-    tips: list[list[float]] = []
-    channels: list[list[tuple[str, int]]] = []
+def _one_skeleton(file: Path, joints: list[_Joint], root: str) -> tuple[list[_Joint], tuple[str, ...]]:
+    """Return the joints of one skeleton, their parents counted among themselves, and a note where the file has several."""
+    starts = [i for i, joint in enumerate(joints) if joint.parent < 0]
+    names = [joints[i].name for i in starts]
+    if root and root not in names:
+        raise InputError(
+            "no such ROOT", file=file, field="HIERARCHY", value=root, mend=f"write FILE#NAME with one of {', '.join(names)}"
+        )
+    sizes = np.diff([*starts, len(joints)])
+    chosen = names.index(root) if root else int(np.argmax(sizes))
+    first = starts[chosen]
+    own = joints[first : first + int(sizes[chosen])]
+    for joint in own:
+        joint.parent -= first if joint.parent >= 0 else 0
+    twice = next((joint.name for k, joint in enumerate(own) if joint.name in {o.name for o in own[:k]}), None)
+    if twice is not None:
+        raise InputError(
+            "a different name for each joint expected", file=file, field="HIERARCHY", value=twice, mend="rename one"
+        )
+    if len(starts) == 1:
+        return own, ()
+    others = ", ".join(f"{n} ({s} joints)" for k, (n, s) in enumerate(zip(names, sizes, strict=True)) if k != chosen)
+    return own, (f"of its skeletons {names[chosen]} ({len(own)} joints) is read; FILE#NAME reads another: {others}",)
+
+
+def _hierarchy(file: Path, text: str) -> list[_Joint]:
+    """Return the joints of all skeletons, each after its parent."""
+    joints: list[_Joint] = []
     open_joints: list[int] = []  # -1 stands for an end site
+    columns = 0
     words = _words(text)
     for line, word in words:
         key = word.lower()
         where = f"line {line}"
+        inner = open_joints[-1] if open_joints else -1
         if key in ("root", "joint"):
             name = " ".join(_until_brace(words))
-            if (key == "root") != (not names) or (key == "joint" and (not open_joints or open_joints[-1] < 0)):
+            if not name or (key == "root") != (not open_joints) or (key == "joint" and inner < 0):
                 raise InputError(
-                    "one ROOT, and each JOINT inside another, expected", file=file, field=where, value=f"{word} {name}"
+                    "a named ROOT, and each JOINT inside another, expected", file=file, field=where, value=f"{word} {name}"
                 )
-            if not name or name in names:
-                raise InputError(
-                    "a different name for each joint expected", file=file, field=where, value=name, mend="rename one"
-                )
-            parents.append(open_joints[-1] if open_joints else -1)
-            open_joints.append(len(names))
-            names.append(name)
-            offsets.append([])
-            tips.append([np.nan] * 3)
-            channels.append([])
+            open_joints.append(len(joints))
+            joints.append(_Joint(name, inner, columns))
         elif key == "end":
             _until_brace(words)
             open_joints.append(-1)
@@ -108,46 +144,40 @@ def _hierarchy(file: Path, text: str) -> tuple[list[str], list[int], np.ndarray,
             open_joints.pop()
         elif key == "offset" and open_joints:
             offset = [_number(file, *next(words)) for _ in range(3)]
-            if open_joints[-1] >= 0:
-                offsets[open_joints[-1]] = offset
+            if inner >= 0:
+                joints[inner].offset = offset
             elif len(open_joints) > 1 and open_joints[-2] >= 0:
-                tips[open_joints[-2]] = offset
-        elif key == "channels" and open_joints and open_joints[-1] >= 0:
+                joints[open_joints[-2]].tip = offset
+        elif key == "channels" and open_joints:
             count = _number(file, *next(words))
-            if count not in range(7):
-                raise InputError("at most 6 channels expected", file=file, field=where, value=count)
-            channels[open_joints[-1]] = [_channel(file, *next(words)) for _ in range(int(count))]
+            if count not in range(7 if inner >= 0 else 1):
+                most = "at most 6 channels" if inner >= 0 else "no channels of an end site"
+                raise InputError(f"{most} expected", file=file, field=where, value=count)
+            if count:
+                joints[inner].column, columns = columns, columns + int(count)
+                joints[inner].channels = [_channel(file, *next(words)) for _ in range(int(count))]
+        elif key == "" and joints and not open_joints:
+            break
         elif key == "" or key != "hierarchy":
             raise InputError(
                 "ROOT, JOINT, End Site, OFFSET, CHANNELS or a closing brace expected", file=file, field=where,
                 value=word or "the end", mend="export the .bvh again",
             )  # fmt: skip
-        if names and not open_joints and key == "}":
-            break
-    _check_whole(file, names, offsets, len(open_joints), words)
-    return names, parents, np.array(offsets), np.array(tips), channels
-
-
-def _check_whole(file: Path, names: list[str], offsets: list[list[float]], unclosed: int, words: Iterator) -> None:
-    """Raise an InputError unless a skeleton has a root, closed braces and all offsets, and no more words follow."""
-    bare = next((n for n, o in zip(names, offsets, strict=True) if not o), None)
-    if not names or unclosed or bare is not None:
+    bare = next((joint.name for joint in joints if not joint.offset), None)
+    if bare is not None:
         raise InputError(
-            "a ROOT with all its braces closed, and an OFFSET for each joint, expected", file=file, field="HIERARCHY",
-            value=bare or f"{len(names)} joints, {unclosed} not closed", mend="export the .bvh again",
-        )  # fmt: skip
-    left = next(words, (0, ""))
-    if left[1]:
-        raise InputError(
-            "one skeleton expected", file=file, field=f"line {left[0]}", value=left[1], mend="export one character"
+            "an OFFSET for each joint expected", file=file, field="HIERARCHY", value=bare, mend="export the .bvh again"
         )
+    return joints
 
 
 def _words(text: str) -> Iterator[tuple[int, str]]:
-    """Yield line number and word of all words, and at the end an empty word, which nothing accepts."""
+    """Yield line number and word of all words but comments, and at the end an empty word, which nothing accepts."""
     line = 0
-    for line, content in enumerate(text.splitlines(), 1):
-        for word in content.replace("{", " { ").replace("}", " } ").split():
+    for line, content in enumerate(text.rstrip("\n").split("\n"), 1):
+        named = content.split(None, 1)[:1] and content.split(None, 1)[0].lower() in ("root", "joint", "end")
+        bare = content if named else without_comments(content)  # a # can be part of a name
+        for word in bare.replace("{", " { ").replace("}", " } ").split():
             yield line, word
     yield line, ""
 
@@ -164,7 +194,7 @@ def _until_brace(words: Iterator[tuple[int, str]]) -> list[str]:
 
 def _number(file: Path, line: int, word: str) -> float:
     try:
-        value = float(word)
+        value = float(word.rstrip(",").replace(",", "."))
     except ValueError:
         value = np.nan
     if not abs(value) < 1e30:
@@ -178,34 +208,3 @@ def _channel(file: Path, line: int, word: str) -> tuple[str, int]:
             "Xposition to Zposition or Xrotation to Zrotation expected", file=file, field=f"line {line}", value=word
         )
     return CHANNELS[word.lower()]
-
-
-def _motion(file: Path, text: str, channels: int) -> tuple[np.ndarray, float]:
-    head = re.match(r"\s*Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)", text, flags=re.IGNORECASE)
-    if head is None:
-        raise InputError("'Frames:' and 'Frame Time:' expected after MOTION", file=file, field="MOTION", mend="export it again")
-    try:
-        frames = int(head[1])
-    except ValueError:
-        frames = 0
-    if frames < 1:
-        raise InputError("at least one frame expected", file=file, field="Frames", value=head[1], mend="export it again")
-    try:
-        period = float(head[2])
-    except ValueError:
-        period = 0.0
-    if not 1e-6 < period < 1e6:
-        raise InputError("seconds above 0 expected", file=file, field="Frame Time", value=head[2], mend="write 1/fps")
-    words = text[head.end() :].split()
-    if channels == 0 or len(words) != frames * channels:
-        raise InputError(
-            f"{frames} frames of {channels} channels expected, {frames * channels} numbers", file=file, field="MOTION",
-            value=f"{len(words)} numbers", mend="the file is cut short or its header is wrong; export it again",
-        )  # fmt: skip
-    try:
-        values = np.array([float(w) for w in words])
-    except ValueError as error:
-        raise InputError(f"numbers expected: {error}", file=file, field="MOTION", mend="export it again") from None
-    fps = 1 / period
-    # Frame times are printed with 6 digits or so: 0.00833333 s is meant to be 120 frames per second.
-    return values.reshape(frames, channels), float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else fps

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ncs_jax.io.character.fbx import Fbx, Record, read_fbx
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
-from ncs_jax.io.character.quaternions import about_axis, multiply, to_matrix
-from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, motion_of, rig_from
+from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, first_that_moves, motion_of, rig_from
+from ncs_jax.io.mesh.polygons import triangulate
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import reading
 
@@ -25,6 +26,7 @@ RATES = {
 }  # fmt: skip
 ORDERS = ("XYZ", "XZY", "YZX", "YXZ", "ZXY", "ZYX")  # the axis named first turns first
 NUMBERS = (int, float)
+LCL = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +83,22 @@ def fbx_body(path: str | Path) -> BodyRecord:
 
 
 def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """Read an animation of an .fbx since the pose of `fbx_body`, at the file's frame rate; the first, or the named one.
+    """Read an animation of an .fbx since the pose of `fbx_body`, at the file's frame rate; the first that moves, or the named.
 
     Joints without curves keep their model's place. In a file without a skin (Mixamo's "Without Skin"), the rest pose is the one
     in which the models stand.
     """
     with reading(Path(path), "FBX"):
         graph = _graph(read_fbx(path))
-        begin, end, curves = _animation(graph, name)
+        begin, end, curves, notes = _animation(graph, name)
         pieces = _pieces(graph)
         turning = [m for (m, p, _), c in curves.items() if p == "Lcl Rotation" and np.ptp(c.values) > 0.01]
         rig = rig_from(
             graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces, sorted(set(turning))
         )
         wanted = rig.nodes.tolist()
-        return motion_of(rig, (begin, end, graph.fps), lambda times: _worlds(graph, wanted, curves, times))
+        found = motion_of(rig, (begin, end, graph.fps), lambda times: _worlds(graph, wanted, curves, times))
+        return replace(found, notes=notes)
 
 
 def _graph(fbx: Fbx) -> Graph:
@@ -168,12 +171,9 @@ def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
 
 
 def _euler(degrees: np.ndarray, order: str = "XYZ") -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of angles about X, Y and Z (..., 3), degrees."""
-    turn = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*degrees.shape[:-1], 4))
-    for axis in order:
-        i = "XYZ".index(axis)
-        turn = multiply(about_axis(i, np.radians(degrees[..., i])), turn)
-    return to_matrix(turn)
+    """Return rotation matrices (..., 3, 3) of angles about X, Y and Z (..., 3), degrees; the axis named first turns first."""
+    angles = degrees[..., ["XYZ".index(axis) for axis in order]].reshape(-1, 3)
+    return Rotation.from_euler(order.lower(), angles, degrees=True).as_matrix().reshape(*degrees.shape, 3)
 
 
 def _local(model: FbxModel, moved: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -246,41 +246,62 @@ def _moved(model: FbxModel, number: int, curves: dict, times: np.ndarray) -> dic
     return found
 
 
-def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, str, int], Curve]]:
-    """Return begin and end of an animation, s, and its curves by (model, property, axis)."""
+def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, str, int], Curve], tuple[str, ...]]:
+    """Return begin and end of an animation, s, its curves by (model, property, axis), and notes on which one it is.
+
+    Without a name it is the first that moves a model: what Mixamo writes begins with an empty take.
+    """
     stacks = [(k, r) for k, r in graph.objects.items() if r.name == "AnimationStack"]
     names = [_name(r) for _, r in stacks]
-    key, stack = stacks[clip_named(graph.fbx.file, names, name)]
     place = {m.key: i for i, m in enumerate(graph.models)}
     above: dict[int, list[tuple[int, str]]] = {}
     for owner, inner in graph.below.items():
         if owner in place:
             for k, p in inner:
                 above.setdefault(k, []).append((place[owner], p))
-    curves: dict[tuple[int, str, int], Curve] = {}
-    for layer, _, _ in graph.under(key, "AnimationLayer"):
-        for node, record, _ in graph.under(layer, "AnimationCurveNode"):
-            for model, kind in above.get(node, []):
-                if not kind.startswith("Lcl "):
-                    continue
-                for _, curve, channel in graph.under(node, "AnimationCurve"):
-                    where = (model, kind, "XYZ".find(channel[-1:]))
-                    if where[2] < 0 or where in curves:
-                        raise graph.fbx.wrong(
-                            "one layer of animation expected",
-                            f"{kind} of {graph.models[model].name}",
-                            channel,
-                            "bake the layers",
-                        )
-                    curves[where] = curve_from(graph.fbx, curve, f"{kind} of {graph.models[model].name}", TICK)
-                _still(record, model, kind, curves)
+    named = clip_named(graph.fbx.file, names, name)
+    full = [n for n, (key, _) in enumerate(stacks) if any(_curve_nodes(graph, key, above))]
+    number, curves, notes = first_that_moves(
+        names, [named] if name else full, lambda n: _curves(graph, stacks[n][0], above),
+        lambda found: any(np.ptp(c.values) > 1e-6 for c in found.values()), full,
+    )  # fmt: skip
     if not curves:
         raise graph.fbx.wrong("curves of some joint expected", "AnimationStack", names, "write FILE#NAME with another of these")
+    key, stack = stacks[number]
+    layers = list(dict.fromkeys(layer for layer, _, _, _ in _curve_nodes(graph, key, above)))
+    if len(layers) > 1:
+        called = ", ".join(_name(graph.objects[layer]) for layer in layers)
+        notes = (*notes, f"of its layers ({called}) the first that moves a joint counts; bake them to have all")
     times = _properties(stack)
     begin, end = (next(iter(times.get(n, [])), 0) / TICK for n in ("LocalStart", "LocalStop"))
     if not end > begin:
         begin, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
-    return float(begin), float(end), curves
+    return float(begin), float(end), curves, notes
+
+
+def _curve_nodes(graph: Graph, stack: int, above: dict) -> Iterator[tuple[int, Record, list, tuple[int, str]]]:
+    """Yield layer, node, curves and (model, property) of all in an animation that moves a model by curves."""
+    for layer, _, _ in graph.under(stack, "AnimationLayer"):
+        for node, record, _ in graph.under(layer, "AnimationCurveNode"):
+            curves = [(r, channel) for _, r, channel in graph.under(node, "AnimationCurve")]
+            yield from ((layer, record, curves, (m, kind)) for m, kind in above.get(node, []) if curves and kind in LCL)
+
+
+def _curves(graph: Graph, stack: int, above: dict) -> dict[tuple[int, str, int], Curve]:
+    """Return the curves of an animation by (model, property, axis); where several layers move one, the first counts."""
+    curves: dict[tuple[int, str, int], Curve] = {}
+    layer_of: dict[tuple[int, str], int] = {}
+    for layer, record, lines, (model, kind) in _curve_nodes(graph, stack, above):
+        if layer_of.setdefault((model, kind), layer) != layer:
+            continue
+        label = f"{kind} of {graph.models[model].name}"
+        for line, channel in lines:
+            where = (model, kind, "XYZ".find(channel[-1:]))
+            if where[2] < 0 or where in curves:
+                raise graph.fbx.wrong("one curve for each of X, Y and Z expected", label, channel, "bake the animation")
+            curves[where] = curve_from(graph.fbx, line, label, TICK)
+        _still(record, model, kind, curves)
+    return curves
 
 
 def _still(record: Record, model: int, kind: str, curves: dict) -> None:
@@ -346,16 +367,8 @@ def _piece(graph: Graph, number: int, mesh: Record, skin: int) -> Piece:
     weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
     scale = model.vector("GeometricScaling", 1.0)
     x = (x * scale) @ _euler(model.vector("GeometricRotation")).T + model.vector("GeometricTranslation")
-    faces = _fans(corners, last)
+    counts = np.diff(np.flatnonzero(last), prepend=-1)
+    whole = np.repeat(counts > 2, counts)  # what has two corners is an edge
+    faces = triangulate(fbx.file, x, counts[counts > 2], corners[whole])
     faces = faces if scale.prod() > 0 else faces[:, ::-1]
     return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])
-
-
-def _fans(corners: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Cut polygons into triangles, each by a fan from its first corner; `last` marks the last corner of each."""
-    stop = np.flatnonzero(last) + 1
-    start = np.concatenate([[0], stop[:-1]])
-    count = np.maximum(stop - start - 2, 0)
-    own = np.repeat(start, count)
-    step = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count) + 1
-    return corners[np.stack([own, own + step, own + step + 1], axis=1)]

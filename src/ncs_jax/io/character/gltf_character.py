@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from ncs_jax.io.character.gltf import Gltf, read_gltf
-from ncs_jax.io.character.quaternions import slerp, to_matrix
-from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, motion_of, rig_from, unique_names
+from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, first_that_moves, motion_of, rig_from, unique_names
 from ncs_jax.io.character.spline import hermite
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import reading
@@ -23,7 +23,7 @@ PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """All nodes (N): names, parents, local translation, rotation (w first) and scale, and `fixed` matrices, NaN elsewhere."""
+    """All nodes (N): names, parents, local translation, rotation (w last) and scale, and `fixed` matrices, NaN elsewhere."""
 
     names: tuple[str, ...]
     parents: np.ndarray
@@ -60,7 +60,7 @@ def gltf_body(path: str | Path) -> BodyRecord:
 
 
 def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """Read an animation of a .glb or .gltf since the pose of `gltf_body`; the first, or the named one.
+    """Read an animation of a .glb or .gltf since the pose of `gltf_body`; the first that moves, or the named.
 
     The frames are the keys, if they have a constant rate of 10 to 240 a second; else there are 30 a second, from the first key
     to the last. Joints without keys keep their node's place. In a file without a skin, the rest pose is the one in which the
@@ -69,12 +69,13 @@ def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):
         nodes = _nodes(gltf)
-        tracks = _tracks(gltf, nodes, name)
+        tracks, notes = _animation(gltf, nodes, name)
         pieces = _pieces(gltf)
         turning = sorted({t.node for t in tracks if t.path == "rotation" and np.ptp(t.values, axis=0).max() > 1e-4})
         rest = _worlds(nodes, range(len(nodes.names)))
         rig = rig_from(gltf.file, nodes.names, nodes.parents, rest, pieces, turning)
-        return motion_of(rig, _span(tracks), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
+        found = motion_of(rig, _span(tracks), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
+        return replace(found, notes=notes)
 
 
 def _nodes(gltf: Gltf) -> Nodes:
@@ -99,7 +100,7 @@ def _nodes(gltf: Gltf) -> Nodes:
     for i, node in enumerate(given):
         translation[i] = gltf.numbers("translation", node, f"node {i}", (0.0, 0.0, 0.0))
         scale[i] = gltf.numbers("scale", node, f"node {i}", (1.0, 1.0, 1.0))
-        rotation[i] = np.roll(gltf.numbers("rotation", node, f"node {i}", (0.0, 0.0, 0.0, 1.0)), 1)
+        rotation[i] = gltf.numbers("rotation", node, f"node {i}", (0.0, 0.0, 0.0, 1.0))
         if "matrix" in node:
             fixed[i] = gltf.numbers("matrix", node, f"node {i}", (0.0,) * 16).reshape(4, 4).T
     names = unique_names([gltf.text("name", node, f"node {i}") for i, node in enumerate(given)])
@@ -128,7 +129,7 @@ def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (),
     for node in line:
         own = nodes.fixed[node]
         if np.isnan(own[0, 0]):
-            turn = to_matrix(moved.get((node, "rotation"), nodes.rotation[node]))
+            turn = Rotation.from_quat(moved.get((node, "rotation"), nodes.rotation[node])).as_matrix()
             linear = turn * moved.get((node, "scale"), nodes.scale[node])[..., None, :]
             place = moved.get((node, "translation"), nodes.translation[node])
             own = np.zeros((*np.broadcast_shapes(linear.shape[:-2], place.shape[:-1]), 4, 4))
@@ -228,12 +229,26 @@ def _floats(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ..
     return _array(gltf, owner, name, where, kinds).astype(np.float64)
 
 
-def _tracks(gltf: Gltf, nodes: Nodes, name: str) -> list[Channel]:
-    """Return the key frames of one animation; those of morph targets and of other properties are ignored."""
+def _animation(gltf: Gltf, nodes: Nodes, name: str) -> tuple[list[Channel], tuple[str, ...]]:
+    """Return the key frames of the named animation, or of the first that moves a node, and a note on the others."""
     animations = gltf.objects("animations")
     names = [gltf.text("name", a, f"animation {i}") for i, a in enumerate(animations)]
-    number = clip_named(gltf.file, names, name)
-    one, where = animations[number], f"animation {number}"
+    named = clip_named(gltf.file, names, name)
+    every = range(len(names))
+    _, found, notes = first_that_moves(
+        names, [named] if name else every, lambda n: _tracks(gltf, nodes, n),
+        lambda tracks: any(np.ptp(t.values, axis=0).max() > 1e-6 for t in tracks), every,
+    )  # fmt: skip
+    if not found:
+        raise gltf.wrong(
+            "keys of some joint expected", "animations", "none", f"write FILE#NAME with one of {', '.join(names)[:400]}"
+        )
+    return found, notes
+
+
+def _tracks(gltf: Gltf, nodes: Nodes, number: int) -> list[Channel]:
+    """Return the key frames of one animation; those of morph targets and of other properties are ignored."""
+    one, where = gltf.objects("animations")[number], f"animation {number}"
     samplers = gltf.objects("samplers", one, where)
     found: dict[tuple[int, str], Channel] = {}
     for c, channel in enumerate(gltf.objects("channels", one, where)):
@@ -247,8 +262,6 @@ def _tracks(gltf: Gltf, nodes: Nodes, name: str) -> list[Channel]:
             raise gltf.wrong("keys once, and of a node without a matrix, expected", label)
         sampler = samplers[gltf.whole("sampler", channel, f"{label}, sampler", len(samplers))]
         found[node, path] = _track(gltf, sampler, node, path, label)
-    if not found:
-        raise gltf.wrong("keys of some joint expected", where, "none", f"write FILE#NAME with one of {', '.join(names)[:400]}")
     return list(found.values())
 
 
@@ -263,10 +276,8 @@ def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Chann
         raise gltf.wrong("as many values as times expected (CUBICSPLINE: three)", label, f"{len(values)} for {len(times)}")
     if times[0] < 0 or (np.diff(times) <= 0).any():
         raise gltf.wrong("rising times from 0 s expected", label, times[max(int(np.argmin(np.diff(times, prepend=-1))), 0)])
-    if path == "rotation":
-        values = np.roll(values, 1, axis=1)
-        if mode != "CUBICSPLINE":
-            values = _unit(gltf, values, label)
+    if path == "rotation" and mode != "CUBICSPLINE":
+        values = _unit(gltf, values, label)
     return Channel(node, path, times, values, mode)
 
 
@@ -283,7 +294,7 @@ def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
         span = keys[low + 1] - keys[low]
         t = (times - keys[low]) / span
         if track.mode == "LINEAR" and track.path == "rotation":
-            return slerp(track.values[low], track.values[low + 1], t)
+            return Slerp(keys, Rotation.from_quat(track.values))(times).as_quat()
         t, span = t[:, None], span[:, None]
         if track.mode == "LINEAR":
             return track.values[low] * (1 - t) + track.values[low + 1] * t

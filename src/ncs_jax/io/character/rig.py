@@ -6,23 +6,39 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
+from unicodedata import normalize
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.hierarchy import by_depth, lowest_common, nearest_parents, path_to_root
-from ncs_jax.io.character.quaternions import from_matrix, to_axis_angle
 from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import LARGEST
 
-__all__ = ["MOST_NODES", "Piece", "Rig", "body_of", "clip_named", "motion_of", "rig_from", "split_clip", "unique_names"]
+__all__ = [
+    "MOST_NODES",
+    "Piece",
+    "Rig",
+    "body_of",
+    "clip_named",
+    "first_that_moves",
+    "motion_of",
+    "rig_from",
+    "split_clip",
+    "unique_names",
+]
 
 GIVE = 0.01  # m by which a bone may change, and share by which a joint may scale; more is an error, less is ignored
 MOST_NODES = 20_000  # of a file
 HOUR = 3600.0  # s; the longest animation
 BLOCK = 256  # frames evaluated at once
 SAME = 1e-3  # of the size of the character: bind matrices that differ by less are the same
+
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +82,17 @@ class Rig:
 
 
 def split_clip(path: str | Path) -> tuple[str, str]:
-    """Return the file and the animation that `FILE.glb#NAME` names; the name is empty where none is given."""
-    found = re.match(r"(.+?\.(?:glb|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
+    """Return the file and the animation, or the ROOT, that `FILE.glb#NAME` names; the name is empty where none is given."""
+    found = re.match(r"(.+?\.(?:bvh|glb|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
     return (found[1], found[2] or "") if found else (str(path), "")
 
 
 def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
-    """Return the number of the animation that has a name; the first where none is given."""
+    """Return the number of the animation that has a name; the first where none is given.
+
+    Letters with accents are the same whether they are written as one character or as two.
+    """
+    names, wanted = [normalize("NFC", n) for n in names], normalize("NFC", wanted)
     if not names:
         raise InputError("an animation expected", file=file, field="animations", value="none", mend="export it with animation")
     if wanted and wanted not in names:
@@ -81,6 +101,29 @@ def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
             mend=f"write FILE#NAME with one of {', '.join(names)[:400]}",
         )  # fmt: skip
     return names.index(wanted) if wanted else 0
+
+
+def first_that_moves(
+    names: Sequence[str],
+    candidates: Sequence[int],
+    read: Callable[[int], Found],
+    moves: Callable[[Found], bool],
+    full: Sequence[int],
+) -> tuple[int, Found, tuple[str, ...]]:
+    """Return the number of the first animation among candidates that moves, what was read of it, and a note on the others.
+
+    Where none moves, the first. `full` are those that could be chosen by name; `read` gives something empty for the others.
+    """
+    found = {}
+    for number in candidates:
+        found[number] = read(number)
+        if moves(found[number]):
+            break
+    else:
+        number = candidates[0] if candidates else 0
+    others = ", ".join(names[n] for n in full if n != number)
+    note = (f"its animation {names[number]} is read; FILE#NAME reads another: {others[:400]}",) if others else ()
+    return number, found[number] if found else read(number), note
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -321,7 +364,8 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
         _check_bones(rig, place[:, 1:] - place[:, above] - bones, first)
         local = world.copy()
         local[:, 1:] = np.swapaxes(world[:, above], -1, -2) @ world[:, 1:]
-        turned.append(to_axis_angle(from_matrix(np.swapaxes(rest, -1, -2) @ local @ rest)))
+        own = np.swapaxes(rest, -1, -2) @ local @ rest
+        turned.append(Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(own.shape[:3]))
         moved.append(place[:, 0] - joints[0])
     return MotionRecord(np.concatenate(turned), np.concatenate(moved), fps, rig.names, joints, rig.parents, rest_rotations=rest)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from ncs_jax.errors import InputError
 
-__all__ = ["LARGEST", "readable", "reading", "replacing", "text_of", "unpackable"]
+__all__ = ["LARGEST", "decoded", "readable", "reading", "replacing", "text_of", "unpackable"]
 
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
 PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
@@ -50,13 +51,29 @@ def reading(file: Path, kind: str) -> Iterator[None]:
 
 
 def text_of(path: str | Path) -> tuple[Path, str]:
-    """Read a whole text file. Bytes that are not UTF-8 are replaced: they can only stand in names and comments."""
+    """Read a whole text file, in any of the encodings of `decoded`; its lines end with a newline alone."""
     file = readable(path)
     size = file.stat().st_size
     if size > LARGEST // 4:
         raise InputError(f"at most {LARGEST // 4} bytes expected", file=file, value=f"{size} bytes", mend="split it")
     with reading(file, "text"):
-        return file, file.read_bytes().decode("utf-8-sig", errors="replace")
+        return file, decoded(file.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decoded(data: bytes) -> str:
+    """Return the text that bytes are: UTF-8, UTF-16 with or without its mark, else Shift-JIS or Western European.
+
+    Bytes from 0x80 to 0x9f tell the last two apart: they begin most Japanese characters, and are no letters of Western Europe.
+    """
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", errors="replace")
+    if b"\0" in data[:4]:  # no text but UTF-16 has a zero byte beside its first letters
+        return data.decode("utf-16-be" if data[:1] == b"\0" else "utf-16-le", errors="replace")
+    with suppress(UnicodeDecodeError):
+        return data.decode("utf-8-sig")
+    with suppress(UnicodeDecodeError):
+        return data.decode("cp932" if re.search(rb"[\x80-\x9f]", data) else "latin-1")
+    return data.decode("latin-1")
 
 
 def unpackable(file: Path, field: str, size: int) -> None:

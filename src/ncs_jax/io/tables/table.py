@@ -119,14 +119,17 @@ def checked_parents(file: Path, field: str, array: np.ndarray, joints: int, name
 
 
 def select(file: Path, frames: int, frame_range: tuple[int, int | None] | None) -> slice:
-    """Return the slice of frames start to stop - 1, after a check that the file has them; a stop of None is the end."""
+    """Return the slice of frames start to stop - 1, after a check that the file has them.
+
+    A stop of None is the end, and a number below 0 counts from the end.
+    """
     if frame_range is None:
         return slice(0, frames)
-    start, stop = frame_range[0], frames if frame_range[1] is None else frame_range[1]
+    start, stop = (frames if n is None else n + frames if n < 0 else n for n in frame_range)
     if not 0 <= start < stop <= frames:
         raise InputError(
             f"0 <= start < stop <= {frames} expected, the number of frames", file=file, field="frame_range",
-            value=(start, stop), mend="choose frames that are in the file",
+            value=frame_range, mend="choose frames that are in the file",
         )  # fmt: skip
     return slice(start, stop)
 

@@ -1,0 +1,252 @@
+"""Motions as people bring them: headers of .bvh as tools write them, and rotations in .npz in every form."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+
+HIERARCHY = """\
+HIERARCHY
+ROOT Hips
+{
+  OFFSET 0.5 90.25 0.0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Spine
+  {
+    OFFSET 0.0 20.5 0.0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0.0 10.5 0.0
+    }
+  }
+}
+"""
+FRAMES = np.round(np.random.default_rng(3).uniform(-80, 80, (8, 9)), 4)
+
+
+def rows(numbers=FRAMES, comma: str = ".", between: str = " ") -> str:
+    return "".join(between.join(f"{n:.4f}".replace(".", comma) for n in row) + "\n" for row in numbers)
+
+
+def bvh(head: str = "Frames: 8\nFrame Time: 0.033333\n", data: str = "", hierarchy: str = HIERARCHY) -> str:
+    return f"{hierarchy}MOTION\n{head}{data or rows()}"
+
+
+def read(tmp_path, data: str | bytes, name: str = "", **options) -> io.MotionRecord:
+    path = tmp_path / "m.bvh"
+    path.write_bytes(data if isinstance(data, bytes) else data.encode())
+    return io.read_motion(f"{path}{name}", **options)
+
+
+PLAIN = bvh()
+SPELLED = {  # the same motion as other tools spell it
+    "blank before the colon": PLAIN.replace("Frames:", "Frames :").replace("Frame Time:", "Frame Time :"),
+    "tabs": PLAIN.replace("Frames: ", "Frames:\t").replace("Frame Time: ", "Frame Time:\t").replace(" ", "\t"),
+    "upper case": PLAIN.upper().replace("SPINE", "Spine").replace("HIPS", "Hips"),
+    "lower case": PLAIN.lower().replace("spine", "Spine").replace("hips", "Hips"),
+    "Windows": PLAIN.replace("\n", "\r\n"),
+    "old Mac": PLAIN.replace("\n", "\r"),
+    "blank lines": PLAIN.replace("\n", "\n\n") + "\n\n",
+    "blanks at the ends": PLAIN.replace("\n", "  \n"),
+    "a byte order mark": "\ufeff" + PLAIN,
+    "UTF-16": PLAIN.encode("utf-16"),
+    "UTF-16 without a mark": PLAIN.encode("utf-16-le"),
+    "comments": "# recorded today\n// at 30\n; by me\n" + PLAIN.replace("MOTION", "  # the motion\nMOTION // now"),
+    "a comment on a line": PLAIN.replace("90.25 0.0", "90.25 0.0 # hips").replace("0.033333", "0.033333 ; 30 fps"),
+    "comments between frames": bvh(data="# first\n" + rows(FRAMES[:3]) + "# later\n" + rows(FRAMES[3:])),
+    "no end site": bvh(hierarchy=HIERARCHY.replace("End Site\n    {\n      OFFSET 0.0 10.5 0.0\n    }\n", "")),
+    "a named end site": PLAIN.replace("End Site", "End Site SpineEnd"),
+    "an end site without channels": PLAIN.replace("0.0 10.5 0.0\n", "0.0 10.5 0.0\n      CHANNELS 0\n"),
+    "scientific": bvh(data="".join(" ".join(f"{n:.8e}".replace("e-0", "e-00") for n in row) + "\n" for row in FRAMES)),
+    "commas between": bvh(data=rows(between=", ")),
+    "wrapped lines": bvh(data=rows().replace(" ", "\n", 40)),
+    "OFFSETs with commas": bvh(hierarchy=HIERARCHY.replace(".5", ",5").replace(".25", ",25")),
+}
+
+
+@pytest.mark.parametrize("case", SPELLED)
+def test_a_bvh_is_read_however_it_is_spelled(tmp_path, case):
+    plain, found = read(tmp_path, PLAIN), read(tmp_path, SPELLED[case])
+    assert found.joint_names == ("Hips", "Spine") and found.fps == 30 and found.notes == ()
+    np.testing.assert_array_equal(found.poses, plain.poses)
+    np.testing.assert_array_equal(found.translation, FRAMES[:, :3] - [0.5, 90.25, 0])
+    np.testing.assert_array_equal(found.joints, plain.joints)
+    expected = Rotation.from_euler("ZXY", FRAMES[:, 6:], degrees=True).as_rotvec()
+    np.testing.assert_allclose(found.poses[:, 1], expected, atol=1e-12)
+
+
+HEADS = {  # what is not as it should be: frames that are read, and a note
+    "one more": ("Frames: 7", rows(), 7, "its header says 7 frames; 1 more at the end"),
+    "two more": ("Frames: 6", rows(), 6, "its header says 6 frames; 2 more at the end"),
+    "one fewer": ("Frames: 9", rows(), 8, "its header says 9 frames, 8 are there"),
+    "cut short": ("Frames: 800", rows(), 8, "its header says 800 frames, 8 are there"),
+    "half a frame more": ("Frames: 8", rows() + "1.0 2.0\n", 8, "the last, of 2 numbers instead of 9, is left out"),
+    "half a frame": ("Frames: 8", rows()[:-30], 7, "8 frames, 7 are there.*the last, of . numbers instead of 9, is left out"),
+    "never filled in": ("Frames: 0", rows(), 8, "its header says 0 frames, 8 are there"),
+    "left at one": ("Frames: 1", rows(), 8, "its header says 1 frames, 8 are there"),
+    "decimal commas": ("Frames: 8", rows(comma=","), 8, "decimal commas"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HEADS)
+def test_frames_that_the_header_does_not_count_are_told(tmp_path, case):
+    head, data, frames, note = HEADS[case]
+    found = read(tmp_path, bvh(f"{head}\nFrame Time: 0.033333\n", data))
+    np.testing.assert_array_equal(found.poses, read(tmp_path, PLAIN).poses[:frames])
+    assert len(found.notes) == 1
+    assert re.search(note, found.notes[0]), found.notes
+
+
+@pytest.mark.parametrize(
+    ("printed", "fps"),
+    [
+        ("0.0333333", 30), ("0.0333", 30), ("0.033", 30), ("0.03", 30), ("0,033333", 30), ("3.3333e-02", 30), (".0333", 30),
+        ("0.00833333", 120), ("0.0083", 120), ("0.008", 125), ("0.017", 60), ("0.0167", 60), ("0.0417", 24), ("0.04", 25),
+        ("0.02", 50), ("0.01", 100), ("0.1", 10), ("0.005", 200), ("0.0333667", 1 / 0.0333667), ("0.0152", 1 / 0.0152),
+        ("33.333", 30), ("16.67", 60), ("8.3333", 120), ("41.67", 24),
+    ],
+)  # fmt: skip
+def test_frame_times_are_rounded_where_they_are_printed(tmp_path, printed, fps):
+    found = read(tmp_path, bvh(f"Frames: 8\nFrame Time: {printed}\n"))
+    assert found.fps == pytest.approx(fps, rel=1e-12)
+    assert [n for n in found.notes if "milliseconds" in n] == list(found.notes[: float(printed.replace(",", ".")) > 1])
+
+
+REFUSED = {
+    "no time": (bvh("Frames: 8\nFrame Time: 0\n"), r"Frame Time: seconds above 0 expected .found '0'.; write 1/fps, 0.033333"),
+    "a rate": (bvh("Frames: 8\nFrame Time: 30\n"), "Frame Time: .*write 0.0333333 if it is frames per second, 0.03 if"),
+    "a film's rate": (bvh("Frames: 8\nFrame Time: 29.97\n"), "Frame Time: .*if it is frames per second"),
+    "NaN of Microsoft": (PLAIN.replace(f"{FRAMES[5, 7]:.4f}", "-nan(ind)"), r"poses, frame 5, joint 1 \(Spine\): finite"),
+    "NaN of old": (PLAIN.replace(f"{FRAMES[2, 4]:.4f}", "-1.#IND00"), r"poses, frame 2, joint 0 \(Hips\): finite"),
+    "NaN": (PLAIN.replace(f"{FRAMES[4, 8]:.4f}", "nan"), r"poses, frame 4, joint 1 \(Spine\): finite"),
+    "infinite": (PLAIN.replace(f"{FRAMES[3, 1]:.4f}", "1.#INF"), "trans, frame 3: finite"),
+    "a word": (PLAIN.replace(f"{FRAMES[6, 7]:.4f}", "1.2.3"), "MOTION, frame 6, Xrotation of Spine: numbers expected"),
+    "too many columns": (bvh(data=rows(np.tile(FRAMES, 2)[:, :12])), "8 frames of 9 channels expected.*a line of 12"),
+    "too few columns": (bvh(data=rows(FRAMES[:, :6])), "8 frames of 9 channels expected.*a line of 6"),
+    "no frames": (bvh(data="\n"), "8 frames of 9 channels expected.*0 numbers"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_bvh_cannot_mean_is_refused_by_name(tmp_path, case):
+    data, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, data)
+    if "finite" in message:  # the other frames are good
+        assert len(read(tmp_path, data, frame_range=(0, 2)).poses) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding"),
+    [
+        ("左足", "cp932"),
+        ("腰", "cp932"),
+        ("センター", "utf-16"),
+        ("Hüfte", "latin-1"),
+        ("hanché", "latin-1"),
+        ("Bip01 左足", "utf-8"),
+    ],
+)
+def test_names_in_the_encodings_of_their_tools(tmp_path, name, encoding):
+    found = read(tmp_path, PLAIN.replace("Spine", name).encode(encoding))
+    assert found.joint_names == ("Hips", name)
+    np.testing.assert_array_equal(found.poses, read(tmp_path, PLAIN).poses)
+
+
+def test_names_with_blanks_and_hashes_are_kept(tmp_path):
+    assert read(tmp_path, PLAIN.replace("Spine", "Left Arm #1 // a")).joint_names[1] == "Left Arm #1 // a"
+
+
+def test_of_several_skeletons_the_largest_or_the_named_is_read(tmp_path):
+    prop = "ROOT Prop\n{\nOFFSET 1.5 0.0 0.0\nCHANNELS 3 Xposition Yposition Zposition\n}\n"
+    twin = HIERARCHY.replace("HIERARCHY\n", "").replace("Hips", "Hips2")
+    extra = np.arange(24.0).reshape(8, 3)
+    before = bvh(data=rows(np.hstack([extra, FRAMES])), hierarchy=HIERARCHY.replace("ROOT Hips", prop + "ROOT Hips"))
+    after = bvh(data=rows(np.hstack([FRAMES, extra])), hierarchy=HIERARCHY + prop)
+    both = bvh(data=rows(np.hstack([FRAMES, FRAMES[::-1]])), hierarchy=HIERARCHY + twin)
+    plain = read(tmp_path, PLAIN)
+    for data, other in ((before, r"Prop \(1 joints\)"), (after, r"Prop \(1 joints\)"), (both, r"Hips2 \(2 joints\)")):
+        found = read(tmp_path, data)
+        np.testing.assert_array_equal(found.poses, plain.poses)
+        np.testing.assert_array_equal(found.translation, plain.translation)
+        assert found.parents.tolist() == [-1, 0]
+        assert re.search(f"Hips.*FILE#NAME reads another: {other}", found.notes[0])
+    second = read(tmp_path, both, "#Hips2")
+    np.testing.assert_array_equal(second.poses, plain.poses[::-1])
+    assert second.joint_names == ("Hips2", "Spine") and second.parents.tolist() == [-1, 0]
+    np.testing.assert_array_equal(read(tmp_path, after, "#Prop").translation, extra - [1.5, 0, 0])
+    with pytest.raises(InputError, match=r"no such ROOT .found 'Prop'.; write FILE#NAME with one of Hips, Hips2"):
+        read(tmp_path, both, "#Prop")
+
+
+# --- rotations in .npz --------------------------------------------------------------------------------------------------------
+
+
+def save(tmp_path, **arrays) -> io.MotionRecord:
+    frames = len(next(iter(arrays.values())))
+    np.savez(tmp_path / "m.npz", trans=np.zeros((frames, 3)), fps=30.0, **arrays)
+    return io.read_motion(tmp_path / "m.npz")
+
+
+def moving(rng, degrees: float, frames: int = 6, joints: int = 5) -> Rotation:
+    axes = rng.normal(size=(frames * joints, 3))
+    return Rotation.from_rotvec(np.radians(degrees) * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("w_first", [True, False])
+@pytest.mark.parametrize("degrees", [0, 25, 80])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_quaternions_called_poses_tell_their_order(tmp_path, rng, w_first, degrees, dtype):
+    turns = moving(rng, degrees)
+    q = (turns.as_quat(scalar_first=w_first) * rng.choice([-1, 1], (30, 1))).reshape(6, 5, 4).astype(dtype)
+    q[:, 0] = Rotation.from_euler("x", 150, degrees=True).as_quat(scalar_first=w_first)  # a root that lies down
+    found = save(tmp_path, poses=q)
+    expected = turns.as_rotvec().reshape(6, 5, 3)[:, 1:]
+    np.testing.assert_allclose(found.poses[:, 1:], expected, atol=2e-6 if dtype == np.float32 else 1e-12)
+    np.testing.assert_allclose(found.poses[:, 0], np.tile([np.radians(150), 0, 0], (6, 1)), atol=2e-6)
+    assert found.notes == (f"its poses are read as quaternions ({'w, x, y, z' if w_first else 'x, y, z, w'})",)
+    assert found.poses.dtype == dtype
+
+
+def test_quaternions_of_either_order_are_not_guessed(tmp_path, rng):
+    for turns in (moving(rng, 120), Rotation.from_rotvec(np.tile([0, 0, np.pi / 2], (30, 1)))):
+        q = turns.as_quat().reshape(6, 5, 4)
+        with pytest.raises(InputError, match=r"poses: quaternions of which most.*write them as `quaternions`"):
+            save(tmp_path, poses=q)
+    q = moving(rng, 30).as_quat().reshape(6, 5, 4)
+    q[4, 2] *= 3
+    with pytest.raises(InputError, match=r"poses, frame 4, joint 2: .*a unit quaternion, expected"):
+        save(tmp_path, poses=q)
+
+
+def test_rotation_matrices_called_poses(tmp_path, rng):
+    turns = moving(rng, 70)
+    matrices = turns.as_matrix().reshape(6, 5, 3, 3)
+    found = save(tmp_path, poses=matrices)
+    np.testing.assert_allclose(found.poses, turns.as_rotvec().reshape(6, 5, 3), atol=1e-12)
+    assert found.notes == ("its poses are rotation matrices",)
+    for bad in (1.1 * matrices[3, 1], -matrices[3, 1], np.zeros((3, 3))):
+        given = matrices.copy()
+        given[3, 1] = bad
+        with pytest.raises(InputError, match="poses, frame 3, joint 1: a rotation matrix expected"):
+            save(tmp_path, poses=given)
+
+
+def test_parts_of_amass_are_checked_in_the_chosen_frames_alone(tmp_path, rng):
+    body = rng.normal(size=(6, 63))
+    body[4, 10] = np.nan
+    np.savez(
+        tmp_path / "m.npz", root_orient=rng.normal(size=(6, 3)), pose_body=body, trans=np.zeros((6, 3)), mocap_framerate=60.0
+    )
+    found = io.read_motion(tmp_path / "m.npz", frame_range=(0, 4))
+    np.testing.assert_array_equal(found.poses[:, 1:].reshape(4, -1), body[:4])
+    np.testing.assert_array_equal(io.read_motion(tmp_path / "m.npz", frame_range=(-6, -2)).poses, found.poses)
+    with pytest.raises(InputError, match="pose_body, frame 4: finite"):
+        io.read_motion(tmp_path / "m.npz", frame_range=(3, None))
