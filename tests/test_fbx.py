@@ -211,7 +211,7 @@ def test_bones_that_stretch_are_refused(tmp_path):
 def take(name: str, number: int, values: list[float], *, empty: bool = False) -> tuple[list, list]:
     """A take that turns the first joint about x, and its links; with `empty`, a layer without curves."""
     stack, layer, node, curve = (1000 * number + k for k in range(4))
-    objects = [
+    objects: list = [
         ("AnimationStack", [stack, f"AnimStack::{name}", ""], []),
         ("AnimationLayer", [layer, "AnimLayer::Base", ""], []),
     ]

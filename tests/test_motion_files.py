@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.scene.spec import packaged, scene_from
 
 HIERARCHY = """\
 HIERARCHY
@@ -250,3 +252,84 @@ def test_parts_of_amass_are_checked_in_the_chosen_frames_alone(tmp_path, rng):
     np.testing.assert_array_equal(io.read_motion(tmp_path / "m.npz", frame_range=(-6, -2)).poses, found.poses)
     with pytest.raises(InputError, match="pose_body, frame 4: finite"):
         io.read_motion(tmp_path / "m.npz", frame_range=(3, None))
+
+
+# --- settings of a file alone ---------------------------------------------------------------------------------------------------
+
+
+def scene(files, **motion):
+    return scene_from({"motion": {"files": files, "fps": 30.0} | motion}, "")
+
+
+@pytest.mark.parametrize(
+    ("given", "chosen"),
+    [
+        ("ncs:walk[10:30]", slice(10, 30)),
+        ("ncs:walk[10:]", slice(10, None)),
+        ("ncs:walk[:30]", slice(0, 30)),
+        ("ncs:walk[-20:]", slice(-20, None)),
+        ("ncs:walk[ 5 : -5 ]", slice(5, -5)),
+        ("ncs:walk[:]", slice(None)),
+        ({"file": "ncs:walk", "frames": [10, 30]}, slice(10, 30)),
+        ({"file": "ncs:walk", "frames": [10]}, slice(10, None)),
+        ({"file": "ncs:walk", "frames": []}, slice(None)),
+        ({"file": "ncs:walk[3:9]", "scale": 2.0}, slice(3, 9)),
+        ("ncs:walk", slice(2, 40)),
+    ],
+)
+def test_frames_of_a_file_override_those_of_the_scene(given, chosen):
+    one, body, whole = scene([given], frames=[2, 40]), io.read_body(packaged("body")), io.read_motion(packaged("walk"))
+    record = load_motion(one, one.motions[0], body)
+    np.testing.assert_array_equal(record.poses, whole.poses[chosen])
+    scale = 2.0 if isinstance(given, dict) and "scale" in given else 1.0
+    np.testing.assert_array_equal(record.translation, scale * whole.translation[chosen])
+    # what a run keeps is the same scene again, its paths and settings too
+    again = scene_from(one.to_dict(), "")
+    assert again.motion == one.motion and again.to_dict() == one.to_dict()
+
+
+def test_a_table_sets_scale_up_and_joints_of_one_file_alone(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.bvh").write_text(PLAIN)
+    entries = [{"file": "a.bvh", "scale": 0.5, "up": "z", "joints": {"Spine": "spine1"}}, "b.bvh"]
+    one = scene_from({"motion": {"files": entries, "validation": ["a.bvh[2:5]"], "scale": 0.25}}, str(tmp_path / "s.toml"))
+    assert one.motions == ("a.bvh", "b.bvh", "a.bvh[2:5]")
+    settings = {name: one.motion_file(name) for name in one.motions}
+    assert [(s.scale, s.up, s.joints, s.frames) for _, s in settings.values()] == [
+        (0.5, "z", {"Spine": "spine1"}, ()), (0.25, "auto", {}, ()), (0.25, "auto", {}, (2, 5)),
+    ]  # fmt: skip
+    assert [p for p, _ in settings.values()] == [tmp_path / "a.bvh", tmp_path / "b.bvh", tmp_path / "a.bvh"]
+    kept = scene_from(one.to_dict(), "elsewhere/run.json")
+    assert kept.motion_file(str(tmp_path / "a.bvh"))[1].up == "z"
+    assert kept.motion_file(f"{tmp_path / 'a.bvh'}[2:5]")[1].frames == (2, 5)
+
+
+WRONG = {
+    "letters": (["ncs:walk[a:b]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write ncs:walk\[10:300\]"),
+    "steps": (["ncs:walk[1:9:2]"], {}, r"motion.files\[0\]: frames as \[START:STOP\]"),
+    "three": ([{"file": "a.bvh", "frames": [1, 2, 3]}], {}, r"motion.files\[0\].frames: one or two numbers"),
+    "below": (["ncs:walk", {"file": "a.bvh", "frames": [-1]}], {}, r"motion.files\[1\].frames\[0\]: a number from 0"),
+    "scale": ([{"file": "a.bvh", "scale": "cm"}], {}, r"motion.files\[0\].scale: a number expected.*found 'cm'"),
+    "up": ([], {"validation": [{"file": "a.bvh", "up": "x"}]}, r"motion.validation\[0\].up: one of auto, y, z"),
+    "key": ([{"file": "a.bvh", "fps": 30}], {}, r"motion.files\[0\].fps: unknown key.*file, frames, scale, up, joints"),
+    "no file": ([{"frames": [1]}], {}, r"motion.files\[0\].file: the motion's file expected"),
+    "twice": ([{"file": "a.bvh[1:2]", "frames": [1]}], {}, r"motion.files\[0\].frames: frames given once"),
+    "two ways": ([{"file": "a.bvh", "scale": 1.0}, "a.bvh"], {}, r"motion.files\[1\]: the same settings"),
+    "no list": ("a.bvh", {}, r"motion.files: a list expected"),
+    "number": ([3.5], {}, r"motion.files\[0\]: text expected"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_settings_of_a_file_that_do_not_fit_are_named(case):
+    files, motion, message = WRONG[case]
+    with pytest.raises(InputError, match=message):
+        scene(files, **motion)
+
+
+def test_frames_that_a_file_lacks_are_named():
+    one = scene(["ncs:walk[10:100000]"])
+    with pytest.raises(InputError, match=r"walk.npz: frame_range: 0 <= start < stop <= .*found .10, 100000"):
+        load_motion(one, one.motions[0], io.read_body(packaged("body")))
+    with pytest.raises(InputError, match=r"motion: frames as \[START:STOP\]"):
+        load_motion(one, "ncs:walk[1-2:]", io.read_body(packaged("body")))

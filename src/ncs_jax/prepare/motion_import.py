@@ -34,12 +34,12 @@ def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: Motion
     Raises:
         InputError: the motion's joints are not the body's and nothing says which is which.
     """
-    notes: tuple[str, ...] = ()
+    notes = motion.notes
     joints = 1 if body is None else len(body.parents)
     if motion.joints is not None and not spec.frames and (first := lead_in_frames(motion)):
         motion = replace(motion, poses=motion.poses[first:], translation=motion.translation[first:])
         which = "frame 0, a pose that jumps into it, is" if first == 1 else f"frames 0 to {first - 1}, which jump into it, are"
-        notes = (f"{which} left out; motion.frames = [0] keeps all",)
+        notes = (*notes, f"{which} left out; motion.frames = [0] keeps all")
     names = () if body is None else body_names(body)
     overridden = set(spec.joints) & set(motion.joint_names or smpl_names(motion.poses.shape[1]))
     if body is not None and (overridden or not _has_joints_of(motion, body, names)):
@@ -136,7 +136,7 @@ def _with_packaged_skeleton(motion: MotionRecord) -> MotionRecord:
 
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
     """Read a motion of the scene for its body, see `retarget_to_body`, and resample it to the scene's frame rate."""
-    path, spec = scene.path(name), scene.motion
+    path, spec = scene.motion_file(name)
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
     try:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_jax.errors import InputError
+from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
 
 __all__ = [
     "PRESETS",
@@ -39,9 +40,12 @@ __all__ = [
 ASSETS = Path(__file__).parents[1] / "assets"
 
 
-def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple = (), above: bool = False):
-    """Return a field with its help text and range; `above` excludes the lower end."""
-    meta = {"help": text, "low": low, "high": high, "choices": choices, "above": above}
+def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple = (), **marks: bool):
+    """Return a field with its help text and range.
+
+    Of the marks, `above` excludes the lower end, and `each` lets a motion's own table override the field.
+    """
+    meta = {"help": text, "low": low, "high": high, "choices": choices, "above": False, "each": False} | marks
     if isinstance(default, list | dict):
         return field(default_factory=lambda: default, metadata=meta)
     if isinstance(default, type):
@@ -76,16 +80,19 @@ class GarmentSpec:
 class MotionSpec:
     """[motion]: what the character does."""
 
-    files: tuple[str, ...] = _f(("ncs:walk",), "motions to train on; empty: the character stands still in its rest pose")
+    files: tuple[str, ...] = _f(("ncs:walk",), "motions to train on, FILE or FILE[10:300]; empty: the character stands still")
     validation: tuple[str, ...] = _f((), "motions to validate on, not to train on")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
     mirror: bool = _f(False, "train on the mirror image of every motion too")
     frames: tuple[int, ...] = _f(
-        (), "first frame to use of every file, and the frame to stop before; empty: all frames", low=0, high=10**9
+        (), "first frame to use of every file, and the frame to stop before; empty: all frames", low=0, high=10**9, each=True
     )
-    scale: float = _f(0.0, "metres a unit of the files; 0: 1, or by the legs for another skeleton", low=0, high=1e6)
-    up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"))
-    joints: dict[str, str] = _f({}, 'the body\'s joint for a joint of a motion, where names do not tell; "" for none')
+    scale: float = _f(0.0, "metres a unit of the files; 0: 1, or by the legs for another skeleton", low=0, high=1e6, each=True)
+    up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"), each=True)
+    joints: dict[str, str] = _f(
+        {}, 'the body\'s joint for a joint of a motion, where names do not tell; "" for none', each=True
+    )
+    own: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})  # by motion, what its table says
 
 
 @dataclass(frozen=True)
@@ -210,6 +217,12 @@ class Scene:
         path = Path(name).expanduser()
         return path if path.is_absolute() or not self.source else Path(self.source).parent / path
 
+    def motion_file(self, name: str) -> tuple[Path, MotionSpec]:
+        """Return the path of a motion, and its settings: the scene's, but for frames in its name and what its table says."""
+        file, frames = split_frames(name)
+        own = self.motion.own.get(name, {}) | ({} if frames is None else {"frames": frames})
+        return self.path(file), dataclasses.replace(self.motion, **own)
+
     @property
     def motions(self) -> tuple[str, ...]:
         """Return the names of all motions, those to train on first."""
@@ -230,8 +243,12 @@ class Scene:
         tables["body"]["file"] = absolute(tables["body"]["file"])
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
         tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
-        for key in ("files", "validation"):
-            tables["motion"][key] = [absolute(name) for name in tables["motion"][key]]
+        own = tables["motion"].pop("own")
+        for key in LISTS:
+            given = [(name, split_frames(name)[0]) for name in tables["motion"][key]]
+            tables["motion"][key] = [
+                with_settings(absolute(file) + name.removeprefix(file), own.get(name, {})) for name, file in given
+            ]
         return tables
 
 
@@ -289,7 +306,15 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
 
 def scene_from(tables: dict, source: str = "") -> Scene:
     """Return a scene from plain tables, which are checked like a file."""
+    own: dict[str, dict[str, Any]] = {}
+    if isinstance(motion := tables.get("motion"), dict):
+        kinds, fields = typing.get_type_hints(MotionSpec), {f.name: f.metadata for f in dataclasses.fields(MotionSpec)}
+        each = tuple(name for name, meta in fields.items() if meta.get("each"))
+        check = lambda name, value, where: _value(kinds[name], value, fields[name], source or "scene", where)  # noqa: E731
+        motion, own = named_motions(motion, source or "scene", check, each)
+        tables = {**tables, "motion": motion}
     scene = _parse(Scene, tables, source or "scene", "")
+    scene = dataclasses.replace(scene, motion=dataclasses.replace(scene.motion, own=own))
     gravity = scene.physics.gravity
     if len(gravity) != 3:
         raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
