@@ -768,7 +768,7 @@ def test_a_folder_does_not_become_a_file_nor_a_file_a_folder(tmp_path):
 
 @pytest.mark.parametrize("given", [(0, 6), (2, 2), (-1, 3), (5, None)])
 def test_frame_ranges_that_do_not_fit(tmp_path, given):
-    with pytest.raises(InputError, match="frame_range"):
+    with pytest.raises(InputError, match="frames: 0 <= start"):
         io.read_motion(save(tmp_path / "m.npz", motion()), frame_range=given)
 
 

@@ -254,7 +254,7 @@ def test_parts_of_amass_are_checked_in_the_chosen_frames_alone(tmp_path, rng):
         io.read_motion(tmp_path / "m.npz", frame_range=(3, None))
 
 
-# --- settings of a file alone ---------------------------------------------------------------------------------------------------
+# --- settings of a file alone ----------------------------------------------------------------------------------------------
 
 
 def scene(files, **motion):
@@ -329,7 +329,7 @@ def test_settings_of_a_file_that_do_not_fit_are_named(case):
 
 def test_frames_that_a_file_lacks_are_named():
     one = scene(["ncs:walk[10:100000]"])
-    with pytest.raises(InputError, match=r"walk.npz: frame_range: 0 <= start < stop <= .*found .10, 100000"):
+    with pytest.raises(InputError, match=r"walk.npz: frames: 0 <= start < stop <= .*found .10, 100000"):
         load_motion(one, one.motions[0], io.read_body(packaged("body")))
     with pytest.raises(InputError, match=r"motion: frames as \[START:STOP\]"):
         load_motion(one, "ncs:walk[1-2:]", io.read_body(packaged("body")))

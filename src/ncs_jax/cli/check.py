@@ -1,27 +1,42 @@
-"""`ncs check`: print what is in a scene, and what is at risk."""
+"""`ncs check`: print what puts a scene at risk, then what is in it, and draw its motions."""
 
 from __future__ import annotations
 
+import re
+import sys
 import textwrap
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
 from ncs_jax.scene.spec import load_scene
 
+if TYPE_CHECKING:
+    from ncs_jax.io import MotionRecord
+    from ncs_jax.prepare.build import Assembly
+
 __all__ = ["add_commands", "check"]
+
+DRAWN = 4  # motions in the picture, at most
+NAMED = 6  # motions of a group that are named, at most
+SMALL = {  # joints that are counted and not named, by the plain words of their names
+    "of fingers": r"(?:hand|f|l|r)?(?:thumb|index|middle|mid|ring|pinky|little|finger|carpal|metacarpal|inhand)[a-z]*\d*",
+    "of toes": r"(?:foot)?(?:bigtoe|indextoe|midtoe|ringtoe|pinkytoe|smalltoe|toe)\d+",
+    "of the face": r"(?:face|up|low|upper|lower|in|out)*(?:tongue|teeth|tooth|jaw|eye|lip|brow|cheek|nose|ear|chin)[a-z]*\d*",
+}
 
 
 def add_commands(commands) -> None:
     """Declare the options."""
-    parser = arguments.command(commands, "check", check, "read and assemble a scene without training it")
+    parser = arguments.command(commands, "check", check, "read and assemble a scene without training it, and draw its motions")
     parser.add_argument("scene", metavar="SCENE", nargs="?", help="scene file (TOML), or ncs:NAME")
+    parser.add_argument("--out", metavar="FILE", default="check.png", help="picture of the motions (default: check.png)")
     parser.add_argument("--fields", action="store_true", help="print a scene file with every field, its default and its range")
 
 
 def check(options) -> int:
-    """Print what is in a scene, and what is at risk."""
-    from ncs_jax.energies.terms import NAMES
-    from ncs_jax.prepare.garment_checks import summarise_surface
+    """Print what puts a scene at risk and what is in it, and draw its motions."""
     from ncs_jax.prepare.scene_checks import find_risks
     from ncs_jax.runs.run import assemble
     from ncs_jax.scene.spec import template
@@ -31,41 +46,125 @@ def check(options) -> int:
         return 0
     if options.scene is None:
         raise InputError("a scene file is needed", mend="give one, ncs:tshirt for the packaged one, or --fields")
-    assembly = assemble(load_scene(options.scene))
+    assembly = assemble(load_scene(options.scene), report=_say)
+    _say("looking for risks")
+    risks = find_risks(assembly)
+    groups = _alike(assembly.motions)
+    drawn = _draw(options.out, assembly, groups)
+    print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
+    for risk in risks:
+        _tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
+    if not risks:
+        _tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
+    _tell_scene(assembly)
+    _tell_motions(assembly, groups)
+    if drawn:
+        _tell("picture", drawn)
+    return 0
+
+
+def _say(words: str) -> None:
+    """Print what is done next, where it does not mix with the results."""
+    print(f"{words} ...", file=sys.stderr, flush=True)
+
+
+def _tell(label: str, text: str) -> None:
+    print(textwrap.fill(text, 128, initial_indent=f"  {label:10}", subsequent_indent=14 * " ", break_on_hyphens=False))
+
+
+def _tell_scene(assembly: Assembly) -> None:
+    """Print what the garment, the body and the physics are."""
+    from ncs_jax.energies.terms import NAMES
+    from ncs_jax.prepare.garment_checks import summarise_surface
+
     model, mesh = assembly.model, assembly.model.garment.mesh
     names = assembly.body.joint_names if assembly.body is not None else ()
     joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
     terms = model.terms
     on = [name for name in NAMES if getattr(terms, name, None)] + [term.__name__ for term in terms.own]
-    print(f"{options.scene}: good")
     mass = float((mesh.vertex_area * model.material.density).sum())
     size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
-    print(f"  garment   {mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
+    _tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
     record = assembly.garment
     parts = summarise_surface(record.vertices, record.faces)
-    print(f"  surface   connected components {parts.components}, boundary loops (holes) {parts.loops}, ", end="")
-    print(f"degenerate triangles {parts.degenerate}")
+    counts = f"connected components {parts.components}, boundary loops (holes) {parts.loops}"
+    _tell("surface", f"{counts}, degenerate triangles {parts.degenerate}")
     kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
-    print(f"  file      {record.scale:g} m a unit, {record.up.upper()} up; {kept}")
+    _tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if assembly.body is not None and model.body is not None:
-        print(f"  body      {len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+        _tell("body", f"{len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
-        print(f"  over      {name}: {len(layer.rest)} vertices")
-    print(f"  joints    {', '.join(joints)}")
+        _tell("over", f"{name}: {len(layer.rest)} vertices")
+    _tell("joints", _without_small(joints))
     if len(model.garment.pins):
-        print(f"  pins      {len(model.garment.pins)} vertices of the group {assembly.scene.garment.pins}")
-    print(f"  energies  {', '.join(on)}" + (f" ({terms.membrane})" if terms.membrane else ""))
-    scene = assembly.scene
+        _tell("pins", f"{len(model.garment.pins)} vertices of the group {assembly.scene.garment.pins}")
+    _tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
+
+
+def _without_small(names: Iterable[str]) -> str:
+    """Return names of joints in a list, those of fingers, toes and the face only counted."""
+    from ncs_jax.prepare.joint_names import side_and_rest
+
+    named, counted = [], dict.fromkeys(SMALL, 0)
+    for name in names:
+        word = side_and_rest(name)[1]
+        kind = next((k for k, pattern in SMALL.items() if re.fullmatch(pattern, word)), None)
+        if kind is None:
+            named.append(name)
+        else:
+            counted[kind] += 1
+    return ", ".join([*named, *(f"{count} {kind}" for kind, count in counted.items() if count)])
+
+
+def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:
+    """Return the motions' names in groups that match the body alike: of one skeleton, with notes equal but for numbers."""
+    groups: dict[tuple, list[str]] = {}
+    for name, record in motions.items():
+        notes = [re.sub(r"\d+(?:\.\d+)?", "#", note) for note in record.notes]
+        groups.setdefault((record.source and record.source.joint_names, *notes), []).append(name)
+    return list(groups.values())
+
+
+def _tell_motions(assembly: Assembly, groups: Sequence[Sequence[str]]) -> None:
+    """Print the motions, and once for those that match alike how they drive the body."""
+    scene, motions = assembly.scene, assembly.motions
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
         for name in names:
-            print(f"  {kind:9} {name}: {len(assembly.motions[name].poses)} frames at {model.fps:g} per second")
-            for note in assembly.motions[name].notes:
-                print(textwrap.fill(note, 128, initial_indent=12 * " ", subsequent_indent=14 * " "))
-    if not model.moves:
+            _tell(kind, f"{name}: {len(motions[name].poses)} frames at {assembly.model.fps:g} per second")
+    if not assembly.model.moves:
         print("  the character never moves: only the static network is trained")
-    risks = find_risks(assembly)
-    for risk in risks:
-        print(f"  at risk   {risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
-    if not risks:
-        print("  safe      material, mesh, fit and motions are inside the ranges of the stability map")
-    return 0
+    for group in groups:
+        shared = [note for note in motions[group[0]].notes if all(note in motions[name].notes for name in group)]
+        if any(motions[name].notes for name in group):
+            _tell("motion" if len(group) == 1 else "motions", _named(group) + ":")
+        for note in shared:
+            _tell("", note)
+        for name in group:
+            for note in motions[name].notes:
+                if note not in shared:
+                    _tell("", note if len(group) == 1 else f"{name}: {note}")
+
+
+def _named(group: Sequence[str]) -> str:
+    """Return the names of motions that match alike, the first few of many."""
+    if len(group) == 1:
+        return group[0]
+    more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
+    return f"{len(group)} match alike: {', '.join(group[:NAMED])}{more}"
+
+
+def _draw(out: str, assembly: Assembly, groups: Sequence[Sequence[str]]) -> str:
+    """Draw one motion of each group; return what the picture shows, nothing where there is none to draw."""
+    if assembly.body is None or not groups:
+        return ""
+    _say("drawing the motions")
+    try:
+        from ncs_jax.view.motion_sheet import motion_sheet
+
+        chosen = {name if len(group) == 1 else f"{name}  (and {len(group) - 1} alike)": assembly.motions[name]
+                  for group in groups[:DRAWN] for name in group[:1]}  # fmt: skip
+        motion_sheet(out, assembly, chosen)
+    except Exception as error:  # a check is worth as much without its picture
+        return f"none: {type(error).__name__} {error}"
+    left = f"; {len(groups) - DRAWN} other kinds of motion are not drawn" if len(groups) > DRAWN else ""
+    return f"{out}: each motion on the character, and below as it was recorded: both must do the same{left}"

@@ -6,7 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["AnimationRecord", "BodyRecord", "GarmentRecord", "MotionRecord"]
+__all__ = ["AnimationRecord", "BodyRecord", "GarmentRecord", "MotionRecord", "SkeletonPoses", "shown_frames"]
+
+SHOWN = 8  # frames of a motion that pictures show
+
+
+def shown_frames(frames: int) -> np.ndarray:
+    """Return the numbers of at most `SHOWN` frames, spread evenly from the first to the last."""
+    return np.unique(np.linspace(0, frames - 1, SHOWN).round().astype(int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +58,20 @@ class GarmentRecord:
 
 
 @dataclass(frozen=True, eq=False)
+class SkeletonPoses:
+    """A skeleton in some frames of a motion, for pictures.
+
+    Attributes:
+        places: (n, J, 3) of the joints in frames spread evenly, m, in the world of the scene. parents: (J,) int32 as in a body.
+        joint_names: J names.
+    """
+
+    places: np.ndarray
+    parents: np.ndarray
+    joint_names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class MotionRecord:
     """The motion of a skeleton.
 
@@ -61,6 +82,7 @@ class MotionRecord:
             (J,) int32 as in a body, and (J, 3) global rest positions of the ends of the last bones, NaN at other joints.
         rest_rotations: (J, 3, 3) as in a body: the axes that the poses are along; None: the world's. up: the axis of the world
             that points up, where the format says so, else "". notes: what was done so that the motion drives the body.
+        source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
     """
 
     poses: np.ndarray
@@ -73,6 +95,7 @@ class MotionRecord:
     rest_rotations: np.ndarray | None = None
     up: str = ""
     notes: tuple[str, ...] = ()
+    source: SkeletonPoses | None = None
 
 
 @dataclass(frozen=True, eq=False)

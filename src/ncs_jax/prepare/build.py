@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -58,23 +58,33 @@ class Assembly:
 
 
 def build(
-    scene: Scene, *, prepared: Prepared | None = None, below: Sequence[tuple[Assembly, dict]] = (), dtype=jnp.float32
+    scene: Scene,
+    *,
+    prepared: Prepared | None = None,
+    below: Sequence[tuple[Assembly, dict]] = (),
+    dtype=jnp.float32,
+    report: Callable[[str], None] | None = None,
 ) -> Assembly:
     """Read every file of a scene, check that they fit together, and precompute all that does not change.
 
     Args:
         scene: from `load_scene`. prepared: that of a run, which needs no training motion any more; None: it is found out here.
         below: the trained garments of `garment.over`, each with its parameters.
-        dtype: of all arrays; float64 needs JAX's x64 mode.
+        dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
+    say = report or (lambda words: None)
+    say(f"reading {scene.garment.file} and {scene.body.file}")
     files = _read(scene, below, dtype)
     motions: dict[str, io.MotionRecord] = {}
     training: list[io.MotionRecord] | None = None
     if prepared is None:
-        motions = {name: load_motion(scene, name, files.body) for name in scene.motions}
+        for name in dict.fromkeys(scene.motions):
+            say(f"reading {name}")
+            motions[name] = load_motion(scene, name, files.body)
+        say("preparing the garment")
         training = [motions[name] for name in scene.motion.files]
         prepared = prepare_scene(files, training)
     model = model_from(files, prepared, dtype)

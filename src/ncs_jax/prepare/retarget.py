@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ncs_jax.errors import InputError, required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
 
 __all__ = ["Retargeted", "body_names", "retarget", "turn_note", "up_rotation", "with_skeleton"]
@@ -137,7 +138,10 @@ def retarget(
     driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
     still = tuple(n for n in names if n not in driven)
     unused = tuple(n for n in motion.joint_names if n not in set(driven.values()))
-    result = Retargeted(MotionRecord(local, translation, motion.fps, names), driven, still, unused, scale)
+    shown = scale * places[shown_frames(len(places))] @ upright.T
+    as_recorded = SkeletonPoses(shown, _skeleton(motion)[1], motion.joint_names)
+    moved = MotionRecord(local, translation, motion.fps, names, source=as_recorded)
+    result = Retargeted(moved, driven, still, unused, scale)
     notes = [*_notes(result, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
         notes.append(f"motion.joints names joints that this motion does not have: {', '.join(absent)}")

@@ -193,6 +193,7 @@ def assemble(
     terms: Sequence[OwnTerm] = (),
     network: NetworkMaker | None = None,
     dtype=jnp.float32,
+    report: Callable[[str], None] | None = None,
 ) -> Assembly:
     """Make a scene ready: read its files and the runs of the garments worn below, check that they fit, precompute the rest.
 
@@ -200,13 +201,13 @@ def assemble(
         scene: from `load_scene`. prepared: of a run, which needs no training motion any more; else found out here.
         terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: makes a network of one's own from scene
             and model, see `network.methods.method.Method`; else the scene's.
-        dtype: of everything; float64 needs JAX's x64 mode.
+        dtype: of everything; float64 needs JAX's x64 mode. report: called with what is done next, in words.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
     below = [load_run(scene.path(name)) for name in scene.garment.over]
-    assembly = build(scene, prepared=prepared, below=[(run.assembly, run.params) for run in below], dtype=dtype)
+    assembly = build(scene, prepared=prepared, below=[(run.assembly, run.params) for run in below], dtype=dtype, report=report)
     if terms:
         assembly = replace(assembly, model=assembly.model.with_terms(terms))
     return assembly if network is None else replace(assembly, network=network(scene, assembly.model))

@@ -128,7 +128,7 @@ def select(file: Path, frames: int, frame_range: tuple[int, int | None] | None) 
     start, stop = (frames if n is None else n + frames if n < 0 else n for n in frame_range)
     if not 0 <= start < stop <= frames:
         raise InputError(
-            f"0 <= start < stop <= {frames} expected, the number of frames", file=file, field="frame_range",
+            f"0 <= start < stop <= {frames} expected, the number of frames", file=file, field="frames",
             value=frame_range, mend="choose frames that are in the file",
         )  # fmt: skip
     return slice(start, stop)

@@ -1,0 +1,148 @@
+"""A picture of motions as they were imported: the character with its garment above the skeleton that drives it.
+
+Only NumPy and Pillow draw, and nothing is compiled: the picture is there in a second or two.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial.transform import Rotation
+
+from ncs_jax.errors import required
+from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.io.records import SkeletonPoses, shown_frames
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.prepare.joint_names import side_and_rest
+from ncs_jax.view.animation import upright
+from ncs_jax.view.camera import Camera
+from ncs_jax.view.ground import Ground
+from ncs_jax.view.pictures import BODY, CLOTH, CLOTH_INSIDE, FAINT, INK
+from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
+
+__all__ = ["motion_sheet", "posed"]
+
+TILE = 150, 230  # pixels of one moment
+TITLE, MARGIN = 30, 34  # pixels above the moments of a motion, and beside them
+TURNED = 25.0  # degrees by which the camera looks from beside the front, so that no limb hides another
+FINE = 3  # drawn so many times larger, then made smaller, for smooth lines
+SIDES = {"left": (38, 110, 190), "right": (200, 72, 40), "": INK}
+
+
+def posed(body: BodyRecord, motion: MotionRecord, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joints' places (n, J, 3), and what takes rest points to some frames by each joint (n, J, 3, 4), in m."""
+    poses = motion.poses[frames].astype(np.float64)
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    if body.rest_rotations is not None:
+        turns = body.rest_rotations @ turns @ np.swapaxes(body.rest_rotations, 1, 2)
+    joints = body.joints.astype(np.float64)
+    places = np.zeros(poses.shape)
+    for j, parent in enumerate(body.parents):
+        if parent < 0:
+            places[:, j] = joints[j] + motion.translation[frames]
+        else:
+            turns[:, j] = turns[:, parent] @ turns[:, j]
+            places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent])
+    moved = places - np.einsum("njab,jb->nja", turns, joints)
+    return places, np.concatenate([turns, moved[..., None]], axis=-1)
+
+
+def motion_sheet(path: str | Path, assembly: Assembly, motions: Mapping[str, MotionRecord]) -> None:
+    """Write a PNG of motions: above, the character with its garment skinned to it; below, the skeleton as it was recorded.
+
+    The skeleton is drawn to the character's scale and from its side: where a motion was read rightly, both do the same. Blue is
+    its left, red its right. A motion of the body's own joints has the body's own skeleton below.
+
+    Args:
+        path: of the PNG. assembly: of a scene with a body. motions: to draw, each under its title.
+    """
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        rows = list(pool.map(lambda title: _motion_row(title, assembly, motions[title]), motions))
+    sheet = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
+    for number, row in enumerate(rows):
+        sheet.paste(row, (0, number * row.height))
+    sheet.save(path, format="PNG")
+
+
+def _motion_row(title: str, assembly: Assembly, record: MotionRecord) -> Image.Image:
+    """Return one motion: its title, the character and the skeleton in some frames, and their times."""
+    body = required(assembly.body, "body.file", "name a body")
+    gravity = np.array(assembly.scene.physics.gravity)
+    up = tuple((-gravity).tolist()) if np.any(gravity) else (0.0, 1.0, 0.0)
+    frames = shown_frames(len(record.poses))
+    joints, matrices = posed(body, record, frames)
+    rest, garment = upright(body.vertices, up), assembly.garment
+    skin = upright(_skinned(matrices, body.weights, body.vertices), up)
+    cloth = upright(_skinned(matrices, assembly.prepared.weights, garment.vertices), up)
+    floor = float(rest[:, 1].min())
+    source = record.source or SkeletonPoses(joints, body.parents, body.joint_names or ("",) * len(body.parents))
+    bones = upright(source.places[: len(frames)], up)
+    low, high = min(floor, float(skin[..., 1].min())), max(float(skin[..., 1].max()), floor + 0.5)
+    (width, height), columns = TILE, len(frames)
+    image = Image.new("RGB", (2 * MARGIN + width * 8, TITLE + 2 * height + 22), PAPER)
+    for column in range(columns):
+        azimuth = TURNED + _heading(rest, skin[column])
+        middle = (skin[column].min(0) + skin[column].max(0)) / 2
+        tall, target = 1.2 * (high - low), np.array([middle[0], (low + high) / 2, middle[2]])
+        camera = Camera(target, tall, azimuth=azimuth, elevation=7.0)
+        meshes = [DrawnMesh(skin[column], body.faces, BODY), DrawnMesh(cloth[column], garment.faces, CLOTH, CLOTH_INSIDE)]
+        ground = Ground(floor, (float(middle[0]), float(middle[2])), 0.3 * tall, cell=0)
+        place = (MARGIN + column * width, TITLE)
+        image.paste(Image.fromarray(render(meshes, camera, TILE, ground=ground, samples=1)), place)
+        own = bones[column] - (bones[column].min(0) + bones[column].max(0)) / 2 * (1, 0, 1) + middle * (1, 0, 1)
+        own[:, 1] += floor - float(bones[..., 1].min())
+        image.paste(_stick_figure(own, source, camera, floor), (place[0], place[1] + height))
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(15)
+    draw.text((MARGIN, TITLE / 2), title, INK, font, "lm")
+    for column, frame in enumerate(frames.tolist()):
+        at = MARGIN + (column + 0.5) * width, TITLE + 2 * height + 10
+        draw.text(at, f"{frame / record.fps:.2f} s", FAINT, ImageFont.load_default(13), "mm")
+    for row, words in enumerate(("ON THE CHARACTER", "AS RECORDED")):
+        label = Image.new("L", (height, MARGIN), 0)
+        ImageDraw.Draw(label).text((height / 2, MARGIN / 2), words, 255, ImageFont.load_default(12), "mm")
+        image.paste(FAINT, (0, TITLE + row * height), label.rotate(90, expand=True))
+    return image
+
+
+def _skinned(matrices: np.ndarray, weights: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return points (n, V, 3) that joints carry from rest, x = sum_j w_j M_j (x0, 1)."""
+    found = []
+    weights, rest = weights.astype(np.float32), rest.astype(np.float32)
+    for each in matrices.astype(np.float32):
+        blended = (weights @ each.reshape(len(each), 12)).reshape(-1, 3, 4)
+        found.append(np.einsum("vab,vb->va", blended[:, :, :3], rest) + blended[:, :, 3])
+    return np.array(found)
+
+
+def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, floor: float) -> Image.Image:
+    """Return the bones of a skeleton (J, 3), farther ones first, on a floor."""
+    width, height = (FINE * n for n in TILE)
+    projection = camera.projection(width, height)
+    image = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(image)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    circle = np.stack([np.cos(angle), np.zeros(49), np.sin(angle)], axis=1) * 0.3 * camera.height
+    x, y, _, _ = projection.project(circle + np.asarray(camera.target) * (1, 0, 1) + (0, floor, 0))
+    draw.polygon(list(zip(x.tolist(), y.tolist(), strict=True)), fill=(236, 232, 225))
+    x, y, near, _ = projection.project(places)
+    sides = [side_and_rest(name)[0] if name else "" for name in source.joint_names]
+    for j in np.argsort(near).tolist():
+        parent = int(source.parents[j])
+        if parent >= 0 and np.isfinite([x[j], y[j], x[parent], y[parent]]).all():
+            draw.line([(x[parent], y[parent]), (x[j], y[j])], SIDES[sides[j]], 2 * FINE, "curve")
+            r = 1.3 * FINE
+            draw.ellipse([x[j] - r, y[j] - r, x[j] + r, y[j] + r], SIDES[sides[j]])
+    return image.resize(TILE, Image.Resampling.LANCZOS)
+
+
+def _heading(rest: np.ndarray, now: np.ndarray) -> float:
+    """Return how far points have turned about Y since rest, degrees: the best fit in x and z."""
+    (x0, _, z0), (x1, _, z1) = (rest - rest.mean(0)).T, (now - now.mean(0)).T
+    return math.degrees(math.atan2((x1 * z0 - z1 * x0).sum(), (x1 * x0 + z1 * z0).sum()))
