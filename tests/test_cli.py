@@ -8,12 +8,15 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ncs_jax import io
-from ncs_jax.cli import main
+from ncs_jax.cli import check, main
+from ncs_jax.io import MotionRecord
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 from ncs_jax.view.character import body_vertices
@@ -275,19 +278,79 @@ def test_help_names_every_command(capsys):
     assert tuple(re.findall(r"^  ncs (\w+) ", overview, re.MULTILINE)) == COMMANDS and sorted(told) == sorted(COMMANDS)
 
 
-def test_check_says_what_is_in_a_scene(tmp_path, capsys):
-    assert main(["check", str(write_scene(tmp_path))]) == 0
-    text = capsys.readouterr().out
+def test_check_says_what_is_in_a_scene_and_draws_it(tmp_path, capsys, monkeypatch):
+    scene = write_scene(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", str(scene)]) == 0
+    text, progress = capsys.readouterr()
     for word in ("good", "30 vertices", "40 triangles", "membrane, bending, collision, gravity, inertia (stvk)", "24 frames"):
         assert word in text
+    assert "picture   check.png: each motion" in text
+    with Image.open(tmp_path / "check.png") as picture:
+        assert picture.format == "PNG" and picture.width > 8 * 100
+    for step in (
+        "reading cloth.npz and body.npz ...",
+        "reading swing.npz ...",
+        "looking for risks ...",
+        "drawing the motions ...",
+    ):
+        assert step in progress and step not in text
 
 
-def test_check_warns_of_a_garment_inside_the_body(tmp_path, capsys):
+def test_check_warns_first_and_is_worth_as_much_without_its_picture(tmp_path, capsys):
     scene = write_scene(tmp_path)
     vertices, faces = grid(origin=(0.0, 0.3, 0.05))
     np.savez(tmp_path / "cloth.npz", vertices=vertices, faces=faces)
-    assert main(["check", str(scene)]) == 0
-    assert "inside the body" in capsys.readouterr().out
+    assert main(["check", str(scene), "--out", str(tmp_path / "nowhere" / "check.png")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r".*scene.toml: good, but at risk: [1-9]", lines[0])
+    assert lines[1].startswith("  at risk") and "inside the body" in "".join(lines)
+    risks = [i for i, line in enumerate(lines) if line.startswith("  at risk")]
+    assert max(risks) < next(i for i, line in enumerate(lines) if line.startswith("  garment"))
+    assert any(line.startswith("  picture   none: FileNotFoundError") for line in lines)
+
+
+def told(motions, capsys) -> str:
+    """What `ncs check` prints of motions, each given by its notes."""
+    records = {name: MotionRecord(np.zeros((5, 1, 3)), np.zeros((5, 3)), 30.0, notes=notes) for name, notes in motions.items()}
+    spec = SimpleNamespace(files=tuple(motions), validation=tuple(motions)[:1])
+    made = SimpleNamespace(scene=SimpleNamespace(motion=spec), motions=records, model=SimpleNamespace(fps=30.0, moves=True))
+    check._tell_motions(made, check._alike(records))
+    return capsys.readouterr().out
+
+
+def test_check_tells_motions_that_match_alike_once(capsys):
+    pairs, other = "retargeted by joint names, 3 of 5: Hips by hip", "retargeted by joint names, 2 of 5: Hips by root"
+    many = {f"{k}.bvh": (pairs, f"a unit is 0.0{k} m", "turned from Z up to Y up") for k in range(1, 10)}
+    text = told(many | {"odd.bvh": (other,), "plain.npz": (), "plainer.npz": ()}, capsys)
+    assert text.count(pairs) == 1 and text.count("turned from") == 1 and text.count(other) == 1
+    assert "alike     9 motions: 1.bvh, 2.bvh, 3.bvh, 4.bvh, 5.bvh, 6.bvh and 3 more\n" in text
+    assert all(f"{name}: a unit is {notes[1][10:]}" in text for name, notes in many.items())
+    assert text.index("odd.bvh: 5 frames") < text.index(other) < text.index("alike")  # alone, below its own line
+    alone = told({"1.bvh": many["1.bvh"]}, capsys)
+    assert "alike" not in alone and alone.count(pairs) == 1
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (
+            "Hips mixamorig:LeftHandThumb1 mixamorig:RightHandPinky3 mixamorig:LeftHand",
+            "Hips, mixamorig:LeftHand, 2 of fingers",
+        ),
+        ("pelvis left_index1 left_middle2 jaw left_eye_smplhf head", "pelvis, head, 2 of fingers, 2 of the face"),
+        ("LThumb LeftFingerBase LeftHandFinger1 LeftHand Head", "LeftHand, Head, 3 of fingers"),
+        ("thumb_01_l pinky_metacarpal_r hand_l foot_l", "hand_l, foot_l, 2 of fingers"),
+        ("Tongue01 UpperTeeth lEye rEye LeftToeBase LeftFoot", "LeftToeBase, LeftFoot, 4 of the face"),
+        (
+            "CC_Base_JawRoot CC_Base_Teeth01 CC_Base_L_Index1 CC_Base_L_Forearm",
+            "CC_Base_L_Forearm, 1 of fingers, 2 of the face",
+        ),
+        ("0 1 2", "0, 1, 2"),
+    ],
+)
+def test_check_counts_fingers_and_parts_of_the_face(names, expected):
+    assert check._without_small(names.split()) == expected
 
 
 def test_train_says_where_it_is(run_folder, tmp_path, capsys):

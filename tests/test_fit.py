@@ -154,7 +154,7 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     scene.write_text(text)
     a = assemble(load_scene(scene))
     np.testing.assert_allclose(a.prepared.weights, written.weights, atol=1e-7)
-    assert main(["check", str(scene)]) == 0
+    assert main(["check", str(scene), "--out", str(tmp_path / "check.png")]) == 0
     assert "inside the body at rest" not in capsys.readouterr().out
     assert main([*command, str(tmp_path / "fitted.obj")]) == 2
     assert "ends in .npz expected" in capsys.readouterr().err

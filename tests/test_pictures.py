@@ -6,17 +6,24 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from ncs_jax import io
 from ncs_jax.energies.terms import MEASURED, NAMES
 from ncs_jax.errors import InputError
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.scene.spec import packaged, scene_from
 from ncs_jax.view import curves, pictures
 from ncs_jax.view.animation import Animation, PosedBody, upright
 from ncs_jax.view.camera import Camera
+from ncs_jax.view.character import body_vertices
 from ncs_jax.view.ground import Ground
+from ncs_jax.view.motion_sheet import MARGIN, TILE, TITLE, _skinned, motion_sheet, posed
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
@@ -315,3 +322,78 @@ def test_matplotlib_stays_out_until_it_is_asked_for():
         "sys.exit(early or 'matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# --- motions as they were imported ----------------------------------------------------------------------------------------
+
+
+LEFT = {"Arm": (1, 15, 20), "ForeArm": (-1, 28, 0), "Hand": (-1, 25, 0), "UpLeg": (0, 9, -4), "Leg": (-1, 0, -40),
+        "Foot": (-1, 0, -40)}  # parent, or the joint before; offset to the left and up, cm  # fmt: skip
+
+
+def figure_in(tmp_path, poses: np.ndarray, up: str = "y"):
+    """A scene with a motion of a person of another skeleton, 15 joints, in cm; joint 3 is the left arm."""
+    names, parents, joints = ["Hips", "Chest", "Head"], [-1, 0, 1], [(0.0, 90.0, 0.0), (0.0, 120.0, 0.0), (0.0, 150.0, 0.0)]
+    for side, sign in (("Left", 1), ("Right", -1)):
+        for part, (above, out, rise) in LEFT.items():
+            parents.append(above if above >= 0 else len(names) - 1)
+            x, y, z = joints[parents[-1]]
+            names.append(side + part)
+            joints.append((x + sign * out, y + rise, z))
+    fields = {"trans": np.zeros((len(poses), 3)), "joints": np.array(joints), "parents": np.array(parents)}
+    np.savez(tmp_path / "m.npz", poses=poses, joint_names=np.array(names), fps=np.array(30.0), **fields)
+    return scene_from({"motion": {"files": ["m.npz"], "up": up}}, str(tmp_path / "scene.toml"))
+
+
+def sheet(tmp_path, scene) -> np.ndarray:
+    body, garment = io.read_body(packaged("body")), io.read_garment(packaged("tshirt"))
+    weights = np.zeros((len(garment.vertices), len(body.parents)))
+    weights[:, 0] = 1
+    record = load_motion(scene, "m.npz", body)
+    made = SimpleNamespace(scene=scene, body=body, garment=garment, prepared=SimpleNamespace(weights=weights))
+    motion_sheet(tmp_path / "sheet.png", made, {"m.npz": record})
+    return np.asarray(Image.open(tmp_path / "sheet.png")).astype(int)
+
+
+def test_a_motion_is_drawn_on_the_character_above_its_own_skeleton(tmp_path):
+    """The skeleton's left is blue and right of the picture's middle; an arm that rises does so in both rows."""
+    poses = np.zeros((20, 15, 3))
+    poses[:, 3, 2] = np.linspace(-1.2, 1.2, 20)  # the left arm, from below to above
+    picture = sheet(tmp_path, figure_in(tmp_path, poses))
+    (width, height), columns = TILE, 8
+    tops = {"skin": [], "blue": []}
+    for column in range(columns):
+        x = MARGIN + column * width
+        above = picture[TITLE : TITLE + height, x : x + width]
+        below = picture[TITLE + height : TITLE + 2 * height, x : x + width]
+        blue = (below[..., 2] > below[..., 0] + 60) & (below[..., 2] > below[..., 1] + 40)
+        red = below[..., 0] > below[..., 2] + 60
+        assert blue.sum() > 100 and red.sum() > 100
+        assert np.nonzero(blue)[1].mean() > np.nonzero(red)[1].mean() + 10
+        skin = np.abs(above - PAPER).max(axis=2) > 40
+        beside = skin[:, 115:]  # where only the left arm reaches
+        tops["skin"].append(np.nonzero(beside)[0].min() if beside.any() else height)
+        tops["blue"].append(np.nonzero(blue)[0].min())
+    assert tops["blue"][0] > tops["blue"][-1] + 20 and tops["skin"][0] > tops["skin"][-1] + 20
+
+
+def test_a_motion_that_lies_down_is_seen_to_lie_in_both_rows(tmp_path):
+    """A skeleton along Y called one along Z falls over: the picture shows it beside one that stands."""
+    poses, spread = 1e-3 * np.ones((9, 15, 3)), {}
+    for up in ("y", "z"):
+        picture = sheet(tmp_path, figure_in(tmp_path, poses, up))
+        for row in range(2):
+            part = picture[TITLE + row * TILE[1] : TITLE + (row + 1) * TILE[1], MARGIN : MARGIN + TILE[0]]
+            ink = np.nonzero(np.abs(part - PAPER).max(axis=2) > 60)
+            spread[up, row] = np.ptp(ink[0]) / np.ptp(ink[1])
+    assert min(spread["y", 0], spread["y", 1]) > 1.3 * max(spread["z", 0], spread["z", 1])
+
+
+def test_the_character_of_a_sheet_is_posed_as_everywhere(rng: np.random.Generator):
+    body = io.read_body(packaged("body"))
+    body = replace(body, rest_rotations=Rotation.random(len(body.parents), rng=rng).as_matrix())
+    motion = io.MotionRecord(rng.normal(size=(3, len(body.parents), 3)), rng.normal(size=(3, 3)), 30.0)
+    places, matrices = posed(body, motion, np.array([0, 2]))
+    carried = np.einsum("njab,jb->nja", matrices[..., :3], body.joints) + matrices[..., 3]
+    np.testing.assert_allclose(carried, places, atol=1e-6)
+    np.testing.assert_allclose(_skinned(matrices, body.weights, body.vertices), body_vertices(body, motion)[[0, 2]], atol=2e-5)

@@ -409,7 +409,7 @@ def test_a_bvh_drives_the_packaged_body_and_check_says_how(tmp_path, rng, capsys
     order = [ends.joint_names.index(n) for n in motion.joint_names]
     np.testing.assert_allclose(ends.joints[order], motion.joints / 100, atol=1e-7)
     (tmp_path / "scene.toml").write_text('[motion]\nfiles = ["run.bvh"]\nframes = [10, 40]\njoints = { rHand = "" }\n')
-    assert main(["check", str(tmp_path / "scene.toml")]) == 0
+    assert main(["check", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "check.png")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert (
         "run.bvh: 30 frames at 30 per second retargeted by joint names, 18 of the body's 31 joints are driven: Hips by hip"

@@ -126,31 +126,29 @@ def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:
 
 
 def _tell_motions(assembly: Assembly, groups: Sequence[Sequence[str]]) -> None:
-    """Print the motions, and once for those that match alike how they drive the body."""
+    """Print the motions and how they drive the body; what several have in common is printed once, after them."""
     scene, motions = assembly.scene, assembly.motions
+    told = [name for group in groups if len(group) > 1 for name in group]
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
         for name in names:
             _tell(kind, f"{name}: {len(motions[name].poses)} frames at {assembly.model.fps:g} per second")
-    if not assembly.model.moves:
-        print("  the character never moves: only the static network is trained")
+            for note in () if name in told else motions[name].notes:
+                _tell("", note)
+            told.append(name)
     for group in groups:
+        if len(group) == 1 or not motions[group[0]].notes:
+            continue
+        more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
+        _tell("alike", f"{len(group)} motions: {', '.join(group[:NAMED])}{more}")
         shared = [note for note in motions[group[0]].notes if all(note in motions[name].notes for name in group)]
-        if any(motions[name].notes for name in group):
-            _tell("motion" if len(group) == 1 else "motions", _named(group) + ":")
         for note in shared:
             _tell("", note)
         for name in group:
             for note in motions[name].notes:
                 if note not in shared:
-                    _tell("", note if len(group) == 1 else f"{name}: {note}")
-
-
-def _named(group: Sequence[str]) -> str:
-    """Return the names of motions that match alike, the first few of many."""
-    if len(group) == 1:
-        return group[0]
-    more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
-    return f"{len(group)} match alike: {', '.join(group[:NAMED])}{more}"
+                    _tell("", f"{name}: {note}")
+    if not assembly.model.moves:
+        print("  the character never moves: only the static network is trained")
 
 
 def _draw(out: str, assembly: Assembly, groups: Sequence[Sequence[str]]) -> str:
