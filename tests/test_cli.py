@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -314,7 +315,9 @@ def told(motions, capsys) -> str:
     """What `ncs check` prints of motions, each given by its notes."""
     records = {name: MotionRecord(np.zeros((5, 1, 3)), np.zeros((5, 3)), 30.0, notes=notes) for name, notes in motions.items()}
     spec = SimpleNamespace(files=tuple(motions), validation=tuple(motions)[:1])
-    made = SimpleNamespace(scene=SimpleNamespace(motion=spec), motions=records, model=SimpleNamespace(fps=30.0, moves=True))
+    made: Any = SimpleNamespace(
+        scene=SimpleNamespace(motion=spec), motions=records, model=SimpleNamespace(fps=30.0, moves=True)
+    )
     check._tell_motions(made, check._alike(records))
     return capsys.readouterr().out
 

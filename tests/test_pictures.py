@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -340,8 +341,9 @@ def figure_in(tmp_path, poses: np.ndarray, up: str = "y"):
             x, y, z = joints[parents[-1]]
             names.append(side + part)
             joints.append((x + sign * out, y + rise, z))
-    fields = {"trans": np.zeros((len(poses), 3)), "joints": np.array(joints), "parents": np.array(parents)}
-    np.savez(tmp_path / "m.npz", poses=poses, joint_names=np.array(names), fps=np.array(30.0), **fields)
+    given = {"joint_names": np.array(names), "joints": np.array(joints), "parents": np.array(parents)}
+    fields: dict[str, Any] = given | {"trans": np.zeros((len(poses), 3)), "poses": poses, "fps": 30.0}
+    np.savez(tmp_path / "m.npz", **fields)
     return scene_from({"motion": {"files": ["m.npz"], "up": up}}, str(tmp_path / "scene.toml"))
 
 
@@ -350,7 +352,7 @@ def sheet(tmp_path, scene) -> np.ndarray:
     weights = np.zeros((len(garment.vertices), len(body.parents)))
     weights[:, 0] = 1
     record = load_motion(scene, "m.npz", body)
-    made = SimpleNamespace(scene=scene, body=body, garment=garment, prepared=SimpleNamespace(weights=weights))
+    made: Any = SimpleNamespace(scene=scene, body=body, garment=garment, prepared=SimpleNamespace(weights=weights))
     motion_sheet(tmp_path / "sheet.png", made, {"m.npz": record})
     return np.asarray(Image.open(tmp_path / "sheet.png")).astype(int)
 

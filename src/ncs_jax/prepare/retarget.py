@@ -122,7 +122,6 @@ def retarget(
     upright = up_rotation(up or motion.up or _up_axis(places, rest, source), world)
     align = _alignment(motion, body, source, target, pairs, quarter, axes)
     world_turns, local = _driven(turns, body, pairs, upright, align)
-
     legs = _leg_length(source, rest)
     scaled_by = "as the scene says" if scale else "by the legs" if legs > 0 else "by the trunk"
     scale = scale or _leg_ratio(rest, body, source, target)
@@ -138,9 +137,7 @@ def retarget(
     driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
     still = tuple(n for n in names if n not in driven)
     unused = tuple(n for n in motion.joint_names if n not in set(driven.values()))
-    shown = scale * places[shown_frames(len(places))] @ upright.T
-    as_recorded = SkeletonPoses(shown, _skeleton(motion)[1], motion.joint_names)
-    moved = MotionRecord(local, translation, motion.fps, names, source=as_recorded)
+    moved = MotionRecord(local, translation, motion.fps, names, source=_shown(motion, scale * places @ upright.T))
     result = Retargeted(moved, driven, still, unused, scale)
     notes = [*_notes(result, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
@@ -244,6 +241,11 @@ def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.
             turns[:, j] = turns[:, parent] @ turns[:, j]
         places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent]).astype(np.float64)
     return turns, places
+
+
+def _shown(motion: MotionRecord, places: np.ndarray) -> SkeletonPoses:
+    """Return a motion's own skeleton, with joints at places (T, J, 3), in the frames that pictures show."""
+    return SkeletonPoses(places[shown_frames(len(places))], _skeleton(motion)[1], motion.joint_names)
 
 
 def _body_axes(joints: np.ndarray, of: Limbs) -> np.ndarray:

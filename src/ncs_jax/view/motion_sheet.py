@@ -86,11 +86,14 @@ def _motion_row(title: str, assembly: Assembly, record: MotionRecord) -> Image.I
     low, high = min(floor, float(skin[..., 1].min())), max(float(skin[..., 1].max()), floor + 0.5)
     (width, height), columns = TILE, len(frames)
     image = Image.new("RGB", (2 * MARGIN + width * 8, TITLE + 2 * height + 22), PAPER)
+    tall, azimuths = 1.15 * (high - low), [TURNED + _heading(rest, x) for x in skin]
+    wide = 1.1 * max(
+        float(np.ptp(x @ (math.cos(a), 0.0, -math.sin(a)))) for x, a in zip(skin, np.radians(azimuths), strict=True)
+    )
     for column in range(columns):
-        azimuth = TURNED + _heading(rest, skin[column])
         middle = (skin[column].min(0) + skin[column].max(0)) / 2
-        tall, target = 1.2 * (high - low), np.array([middle[0], (low + high) / 2, middle[2]])
-        camera = Camera(target, tall, azimuth=azimuth, elevation=7.0)
+        target = np.array([middle[0], (low + high) / 2, middle[2]])
+        camera = Camera(target, tall, wide, azimuths[column], elevation=7.0)
         meshes = [DrawnMesh(skin[column], body.faces, BODY), DrawnMesh(cloth[column], garment.faces, CLOTH, CLOTH_INSIDE)]
         ground = Ground(floor, (float(middle[0]), float(middle[2])), 0.3 * tall, cell=0)
         place = (MARGIN + column * width, TITLE)
@@ -128,7 +131,7 @@ def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, flo
     image = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(image)
     angle = np.linspace(0, 2 * np.pi, 49)
-    circle = np.stack([np.cos(angle), np.zeros(49), np.sin(angle)], axis=1) * 0.3 * camera.height
+    circle = 0.3 * camera.height * np.stack([np.cos(angle), np.zeros(49), np.sin(angle)], axis=1)
     x, y, _, _ = projection.project(circle + np.asarray(camera.target) * (1, 0, 1) + (0, floor, 0))
     draw.polygon(list(zip(x.tolist(), y.tolist(), strict=True)), fill=(236, 232, 225))
     x, y, near, _ = projection.project(places)
