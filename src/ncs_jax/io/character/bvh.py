@@ -73,13 +73,16 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
     positions = np.broadcast_to(offsets[0], (len(values), 3)).copy()
     for j, joint in enumerate(joints):
         own = values[:, joint.column : joint.column + len(joint.channels)]
-        turn = Rotation.identity(len(values))
+        turning = [c for c, (kind, _) in enumerate(joint.channels) if kind == "rotation"]
+        if turning:
+            axes = "".join("XYZ"[joint.channels[c][1]] for c in turning)  # capitals: each about the axes turned before
+            known = np.isfinite(own[:, turning]).all(axis=1)
+            poses[known, j] = Rotation.from_euler(axes, own[known][:, turning], degrees=True).as_rotvec()
+            poses[~known, j] = np.nan
         for (kind, axis), value in zip(joint.channels, own.T, strict=True):
             if kind == "rotation":
-                angle = np.where(np.isfinite(value), value, 0)
-                turn = turn * Rotation.from_euler("xyz"[axis], angle[:, None], degrees=True)
-                poses[~np.isfinite(value), j] = np.nan
-            elif j == 0:
+                continue
+            if j == 0:
                 positions[:, axis] = value
             elif np.ptp(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
                 raise InputError(
@@ -87,7 +90,6 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
                     value=f"its {'XYZ'[axis]}position varies by {np.ptp(value):.3g}",
                     mend="export positions for the root only",
                 )  # fmt: skip
-        poses[:, j] += turn.as_rotvec()
     return Bvh(
         file, tuple(joint.name for joint in joints), np.array([joint.parent for joint in joints], np.int32), offsets,
         np.array([joint.tip for joint in joints]), poses, positions, fps, (*note, *notes),
@@ -156,6 +158,8 @@ def _hierarchy(file: Path, text: str) -> list[_Joint]:
             if count:
                 joints[inner].column, columns = columns, columns + int(count)
                 joints[inner].channels = [_channel(file, *next(words)) for _ in range(int(count))]
+                if len(set(joints[inner].channels)) < count:
+                    raise InputError("each channel once expected", file=file, field=where, value=f"of {joints[inner].name}")
         elif key == "" and joints and not open_joints:
             break
         elif key == "" or key != "hierarchy":
