@@ -69,6 +69,7 @@ SPELLED = {  # the same motion as other tools spell it
     "scientific": bvh(data="".join(" ".join(f"{n:.8e}".replace("e-0", "e-00") for n in row) + "\n" for row in FRAMES)),
     "commas between": bvh(data=rows(between=", ")),
     "wrapped lines": bvh(data=rows().replace(" ", "\n", 40)),
+    "ended by an old editor": PLAIN + "\x1a\0\0",
     "OFFSETs with commas": bvh(hierarchy=HIERARCHY.replace(".5", ",5").replace(".25", ",25")),
 }
 

@@ -12,7 +12,9 @@ def add_commands(commands) -> None:
     """Declare the options of both commands."""
     parser = arguments.command(commands, "animate", animate, "animate a trained garment over a motion")
     parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
-    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    parser.add_argument(
+        "--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: the scene's first motion)"
+    )
     parser.add_argument(
         "--alpha",
         type=arguments.finite,

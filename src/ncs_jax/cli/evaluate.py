@@ -9,6 +9,7 @@ import numpy as np
 
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
+from ncs_jax.scene.motion_names import split_frames
 from ncs_jax.scene.spec import load_scene
 
 __all__ = ["add_commands", "evaluate"]
@@ -20,7 +21,7 @@ def add_commands(commands) -> None:
         commands, "evaluate", evaluate, "measure strain, shear, penetration, energies and forces out of balance"
     )
     parser.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
-    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's)")
+    parser.add_argument("--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: all of the scene's)")
     parser.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
     parser.add_argument("--alpha", type=arguments.finite, default=1.0, help="motion control")
     parser.add_argument(
@@ -78,7 +79,9 @@ def evaluate(options) -> int:
     if len(means) > 1:
         every = dict.fromkeys(k for m in means.values() for k in m)
         means["all"] = summarise({k: np.array([m[k] for m in means.values() if k in m]) for k in every})
-    labels = [name if name.startswith("ncs:") else Path(name).stem for name in means]
+    files = [split_frames(name)[0] for name in means]
+    short = [file if file.startswith("ncs:") else Path(file).stem for file in files]
+    labels = [label + name.removeprefix(file) for label, name, file in zip(short, means, files, strict=True)]
     width = max(map(len, labels)) + 2
     for quantity in dict.fromkeys(k for m in means.values() for k in m):
         unit, text = (QUANTITIES | MEASURES).get(quantity, ("J", "energy"))

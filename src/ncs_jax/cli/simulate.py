@@ -16,7 +16,9 @@ def add_commands(commands) -> None:
         commands, "simulate", simulate, "animate the garment of a scene by full-space simulation, without a network"
     )
     parser.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
-    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first motion)")
+    parser.add_argument(
+        "--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: the scene's first motion)"
+    )
     parser.add_argument(
         "--out", required=True, metavar="FILE",
         help=f"{arguments.FORMATS}; an interrupted simulation goes on from FILE.partial.npz",

@@ -13,7 +13,9 @@ def add_commands(commands) -> None:
         commands, "view", view, "look at a run, an animation or a scene in a browser page: play, scrub, orbit, alpha, colours"
     )
     parser.add_argument("target", metavar="RUN|FILE|SCENE", help="run folder; animation file together with --scene; or scene")
-    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: all of the scene's, to be chosen)")
+    parser.add_argument(
+        "--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: all of the scene's, to be chosen)"
+    )
     parser.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
     parser.add_argument(
         "--overlay", metavar="RUN|FILE", nargs="+", default=[], help="others of the first motion, to lay over it"

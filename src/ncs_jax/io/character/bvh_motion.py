@@ -38,7 +38,7 @@ def read_values(file: Path, text: str, labels: Sequence[str]) -> tuple[np.ndarra
     Raises:
         InputError: the header or a number cannot be read, there is no frame, or lines and channels do not fit together.
     """
-    text = without_comments(text)
+    text = without_comments(text.rstrip("\0\x1a \n"))  # old editors end a file with such bytes
     head = HEAD.match(text)
     if head is None:
         raise InputError("'Frames:' and 'Frame Time:' expected after MOTION", file=file, field="MOTION", mend="export it again")
