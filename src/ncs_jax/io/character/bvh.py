@@ -77,23 +77,29 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
         if turning:
             axes = "".join("XYZ"[joint.channels[c][1]] for c in turning)  # capitals: each about the axes turned before
             known = np.isfinite(own[:, turning]).all(axis=1)
-            poses[known, j] = Rotation.from_euler(axes, own[known][:, turning], degrees=True).as_rotvec()
-            poses[~known, j] = np.nan
+            turns = Rotation.from_euler(axes, np.where(known[:, None], own[:, turning], 0), degrees=True).as_rotvec()
+            poses[:, j] = np.where(known[:, None], turns, np.nan)
         for (kind, axis), value in zip(joint.channels, own.T, strict=True):
             if kind == "rotation":
                 continue
             if j == 0:
                 positions[:, axis] = value
-            elif np.ptp(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
+            elif _range(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
                 raise InputError(
                     "bones of fixed length expected", file=file, field=f"joint {joint.name}",
-                    value=f"its {'XYZ'[axis]}position varies by {np.ptp(value):.3g}",
+                    value=f"its {'XYZ'[axis]}position varies by {_range(value):.3g}",
                     mend="export positions for the root only",
                 )  # fmt: skip
     return Bvh(
         file, tuple(joint.name for joint in joints), np.array([joint.parent for joint in joints], np.int32), offsets,
         np.array([joint.tip for joint in joints]), poses, positions, fps, (*note, *notes),
     )  # fmt: skip
+
+
+def _range(values: np.ndarray) -> float:
+    """Return how far apart the finite ones of some values are."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if len(known) else 0.0
 
 
 def _one_skeleton(file: Path, joints: list[_Joint], root: str) -> tuple[list[_Joint], tuple[str, ...]]:
