@@ -44,7 +44,7 @@ class Limbs:
     """The joints of a skeleton by what they are.
 
     roles: the joint of each role, such as "hips", "head", "left forearm"; a joint without a role is listed by its plain name.
-    spine: joints from above the hips to the one that carries the arms. neck: joints from there to below the head.
+    spine: joints from above or beside the hips to the one that carries the arms. neck: joints from there to below the head.
     """
 
     roles: dict[str, int]
@@ -87,7 +87,8 @@ def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
     if chest is None and head is not None:
         carried = [j for j in above[head] if not plain[j][1].startswith(("neck", "head"))]
         chest = carried[0] if carried else None
-    spine = _between(hips, chest, above)
+    common = next((j for j in above[hips] if chest is not None and j in above[chest]), hips)  # hips and spine may be siblings
+    spine = _between(common, chest, above)
     neck = _between(chest if chest is not None else hips, head, above)[:-1]
     trunk = {hips, *spine, *neck}
     roles = {word: j for word, j in roles.items() if j not in trunk} | {"hips": hips}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +15,22 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
-from ncs_jax.prepare.retarget import body_names, retarget, turn_note, up_rotation, with_skeleton
+from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_person, since
+from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
+from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.spec import MotionSpec, Scene, packaged
+
+Reader = Callable[[int, int | None], MotionRecord]
 
 __all__ = ["lead_in_frames", "load_motion", "retarget_to_body"]
 
+LOOK = 10  # first frames of a file among which a T-pose is looked for
 JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
 
 
-def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: MotionSpec, world: str = "y") -> MotionRecord:
+def retarget_to_body(
+    motion: MotionRecord, body: BodyRecord | None, spec: MotionSpec, world: str = "y", read: Reader | None = None
+) -> MotionRecord:
     """Return a motion as one of the body's joints, in m; its `notes` say what was done.
 
     A motion with another skeleton or other joints is retargeted (`retarget.retarget`). Where the motion has its own skeleton,
@@ -29,15 +38,17 @@ def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: Motion
     55 joints drive each other's bodies joint by joint. So do motions of as many joints as the body has, matched by name.
 
     Args:
-        motion: as read. body: None for a garment without one. spec: gives up, scale and joints. world: the axis that points up.
+        motion: as read. body: None for a garment without one. spec: gives up, scale, rest and joints. world: the axis that
+            points up. read: gives frames start to stop - 1 of the file, also such as the scene leaves out; None: the motion's.
 
     Raises:
         InputError: the motion's joints are not the body's and nothing says which is which.
     """
     notes = motion.notes
     joints = 1 if body is None else len(body.parents)
+    read = read or partial(_frames, motion)
     if motion.joints is not None and not spec.frames and (first := lead_in_frames(motion)):
-        motion = replace(motion, poses=motion.poses[first:], translation=motion.translation[first:])
+        motion = _frames(motion, first)
         which = "frame 0, a pose that jumps into it, is" if first == 1 else f"frames 0 to {first - 1}, which jump into it, are"
         notes = (*notes, f"{which} left out; motion.frames = [0] keeps all")
     names = () if body is None else body_names(body)
@@ -45,9 +56,10 @@ def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: Motion
     if body is not None and (overridden or not _has_joints_of(motion, body, names)):
         smpl = None if overridden else _between_smpl(motion, body)
         if smpl is None:
-            up, source = "" if spec.up == "auto" else spec.up, with_skeleton(_with_packaged_skeleton(motion), joints)
-            found = retarget(source, body, joints=spec.joints, scale=spec.scale, up=up, world=world).motion
-            return replace(found, notes=notes + found.notes)
+            motion = replace(motion, notes=notes)
+            source = _since_a_person(with_skeleton(_with_packaged_skeleton(motion), joints), body, spec, read)
+            found = retarget(source, body, joints=spec.joints, scale=spec.scale, world=world).motion
+            return replace(found, notes=source.notes + found.notes)
         motion, notes = smpl, (*notes, *smpl.notes)
     if motion.poses.shape[1] != joints:
         raise InputError(
@@ -75,6 +87,39 @@ def retarget_to_body(motion: MotionRecord, body: BodyRecord | None, spec: Motion
         translation = (home + translation) @ turn.T - home
         notes = (*notes, *turn_note(turn))
     return MotionRecord(poses, translation, motion.fps, names, notes=notes)
+
+
+def _frames(motion: MotionRecord, start: int, stop: int | None = None) -> MotionRecord:
+    """Return frames start to stop - 1 of a motion."""
+    if start >= len(motion.poses):
+        raise InputError(f"a frame below {len(motion.poses)} expected", field="frames", value=start)
+    return replace(motion, poses=motion.poses[start:stop], translation=motion.translation[start:stop])
+
+
+def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, read: Reader) -> MotionRecord:
+    """Return a motion whose zero pose is a person's, as the scene says or as found (`reference_pose`), its up axis with it."""
+    if spec.rest not in ("auto", "zero") and not spec.rest.isdecimal():
+        raise InputError('"auto", "zero" or the number of a frame expected', field="motion.rest", value=spec.rest)
+    motion = motion if spec.up == "auto" else replace(motion, up=spec.up)
+    of = paired(motion, body, spec.joints)[0]
+    if spec.rest == "zero" or (spec.rest == "auto" and is_person(rest_of(motion)[0], of)):
+        return motion
+    up = motion.up or standing_axis(motion, of)
+    if spec.rest == "auto":
+        start = spec.frames[0] if spec.frames else 0
+        try:
+            first = read(0, min(start, LOOK)) if start > 0 else _frames(motion, 0, LOOK) if spec.frames else read(0, LOOK)
+        except InputError:  # frames that the scene leaves out may be broken
+            first = _frames(motion, 0, LOOK)
+        found = find_reference(motion, of, up, first)
+    else:
+        number = int(spec.rest)
+        said = f"the reference pose is frame {number}, as motion.rest says"
+        try:
+            found = from_frame(read(number, number + 1), of, up, 0, said)
+        except InputError as error:
+            raise InputError(error.expected, field="motion.rest", value=spec.rest, mend="write a frame of the file") from None
+    return replace(since(motion, found), up=up, notes=(*motion.notes, found.note))
 
 
 def lead_in_frames(motion: MotionRecord) -> int:
@@ -140,9 +185,11 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
     try:
-        record = retarget_to_body(
-            io.read_motion(path, frame_range=chosen), body, spec, "z" if np.abs(gravity).argmax() == 2 else "y"
+        record = io.read_motion(path, frame_range=chosen)
+        read = (
+            partial(_frames, record) if chosen is None else lambda start, stop: io.read_motion(path, frame_range=(start, stop))
         )
+        record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
     except InputError as error:
         if error.file is not None:
             raise

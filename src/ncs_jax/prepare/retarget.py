@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ncs_jax.errors import InputError, required
+from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
+from ncs_jax.prepare.skeleton import LIMBS, body_axes, bone, forward, least_turn, rest_of, top, up_axis
 
-__all__ = ["Retargeted", "body_names", "retarget", "turn_note", "up_rotation", "with_skeleton"]
+__all__ = ["Retargeted", "body_names", "paired", "retarget", "sole_heights", "turn_note", "up_rotation", "with_skeleton"]
 
-# The bones that are aligned at rest, from the trunk outward: the role at either end.
-LIMBS = {"arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 LEG = 0.5, 1.1  # m from hip to ankle of a grown person, to tell units apart
 SAMPLES = 2000  # frames; a longer motion has its soles measured in this many at least
@@ -114,12 +112,12 @@ def retarget(
     Raises:
         InputError: no names, names that do not match, or overrides that name no joint of the body.
     """
-    joints, names, rest = joints or {}, body_names(body), _skeleton(motion)[0]
-    source, target, pairs = _paired(motion, body, joints)
-    turns, places = _forward(motion)
-    axes = _body_axes(body.joints, target)
-    quarter = _body_axes(rest, source) @ axes.T
-    upright = up_rotation(up or motion.up or _up_axis(places, rest, source), world)
+    joints, names, rest = joints or {}, body_names(body), rest_of(motion)[0]
+    source, target, pairs = paired(motion, body, joints)
+    turns, places = forward(motion)
+    axes = body_axes(body.joints, target)
+    quarter = body_axes(rest, source) @ axes.T
+    upright = up_rotation(up or motion.up or up_axis(places, rest, source), world)
     align = _alignment(motion, body, source, target, pairs, quarter, axes)
     world_turns, local = _driven(turns, body, pairs, upright, align)
     legs = _leg_length(source, rest)
@@ -128,10 +126,10 @@ def retarget(
     hips_s, hips_t = source.roles["hips"], target.roles["hips"]
     home = body.joints[hips_t] - scale * quarter.T @ rest[hips_s]
     bodily = replace(motion, poses=local, translation=np.zeros((len(turns), 3)), joints=body.joints, parents=body.parents)
-    offsets = _forward(bodily, world_turns)[1]  # with the root at its rest place
+    offsets = forward(bodily, world_turns)[1]  # with the root at its rest place
     translation = home + scale * places[:, hips_s] @ upright.T - offsets[:, hips_t]
     height = "xyz".index(world)
-    soles = _sole_heights(body, target, world_turns, offsets + translation[:, None], height, axes[:, 1])
+    soles = sole_heights(body, target, world_turns, offsets + translation[:, None], height, axes[:, 1])
     low = np.percentile(soles, 5)
     translation[:, height] -= low
     driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
@@ -145,7 +143,7 @@ def retarget(
     return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright))))
 
 
-def _paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -> tuple[Limbs, Limbs, dict[int, int]]:
+def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -> tuple[Limbs, Limbs, dict[int, int]]:
     """Return the limbs of the motion's skeleton and of the body, and the motion's joint of each body joint that is driven.
 
     A joint of the motion that an override pairs with the body's takes that joint's role.
@@ -156,7 +154,7 @@ def _paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -
             "a body with joint names expected, as the motion has another skeleton", field="joint_names", value="none",
             mend="write joint_names (J,) into the body's file",
         )  # fmt: skip
-    source, target = anatomy(motion.joint_names, _skeleton(motion)[1].tolist()), anatomy(names, body.parents.tolist())
+    source, target = anatomy(motion.joint_names, rest_of(motion)[1].tolist()), anatomy(names, body.parents.tolist())
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
     if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
@@ -195,14 +193,6 @@ def turn_note(turn: np.ndarray) -> tuple[str, ...]:
     return () if turn[1, 1] else ("turned from Z up to Y up" if turn[1, 2] > 0 else "turned from Y up to Z up",)
 
 
-QUARTERS = [
-    np.array(signs)[:, None] * np.eye(3)[list(order)]
-    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))
-    for signs in product((1, -1), repeat=3)
-]
-QUARTERS = [q for q in QUARTERS if np.linalg.det(q) > 0]  # the 24 rotations of a cube, the identity first
-
-
 def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[str, ...], joints: Mapping[str, str]) -> dict:
     """Return the pairs after the user's overrides: a joint that they name drives what they say and nothing else."""
     for theirs, ours in joints.items():
@@ -217,75 +207,9 @@ def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[st
     return dict(sorted(pairs.items()))
 
 
-def _skeleton(motion: MotionRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Return a motion's joints at rest and their parents."""
-    mend = "give it a skeleton: see with_skeleton"
-    return required(motion.joints, "joints", mend), required(motion.parents, "parents", mend)
-
-
-def _forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return world rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
-    joints, parents = _skeleton(motion)
-    given = turns is not None
-    if turns is None:
-        turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix()
-        turns = turns.reshape(*motion.poses.shape, 3)
-        if motion.rest_rotations is not None:
-            turns = motion.rest_rotations @ turns @ np.swapaxes(motion.rest_rotations, 1, 2)
-    places = np.zeros(motion.poses.shape)
-    for j, parent in enumerate(parents):
-        if parent < 0:
-            places[:, j] = joints[j] + motion.translation
-            continue
-        if not given:
-            turns[:, j] = turns[:, parent] @ turns[:, j]
-        places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent]).astype(np.float64)
-    return turns, places
-
-
 def _shown(motion: MotionRecord, places: np.ndarray) -> SkeletonPoses:
     """Return a motion's own skeleton, with joints at places (T, J, 3), in the frames that pictures show."""
-    return SkeletonPoses(places[shown_frames(len(places))], _skeleton(motion)[1], motion.joint_names)
-
-
-def _body_axes(joints: np.ndarray, of: Limbs) -> np.ndarray:
-    """Return columns that point left, up and forward of a skeleton at rest, each along the nearest axis of coordinates."""
-    sides = [
-        joints[of.roles[f"left {r}"]] - joints[of.roles[f"right {r}"]]
-        for r in ("thigh", "arm")
-        if f"left {r}" in of.roles and f"right {r}" in of.roles
-    ]
-    left = np.sum(sides, axis=0) if sides else np.zeros(3)
-    up = joints[_top(of)] - joints[of.roles["hips"]]
-    forward = np.cross(left, up)
-    if not np.linalg.norm(forward) > 0:  # no two sides, or no height
-        return np.eye(3)
-    left, forward = left / np.linalg.norm(left), forward / np.linalg.norm(forward)
-    found = np.stack([left, np.cross(forward, left), forward], axis=1)
-    return min(QUARTERS, key=lambda q: -np.trace(q.T @ found))
-
-
-def _top(of: Limbs) -> int:
-    """Return the highest joint of the trunk: the head, else the last of the neck, of the spine, or the hips."""
-    return of.roles["head"] if "head" in of.roles else (of.neck or of.spine or (of.roles["hips"],))[-1]
-
-
-def _up_axis(places: np.ndarray, joints: np.ndarray, of: Limbs) -> str:
-    """Return the axis of the world that points up: z where hips to head lie along it at rest and on average, else y."""
-    rest = joints[_top(of)] - joints[of.roles["hips"]]
-    mean = (places[:, _top(of)] - places[:, of.roles["hips"]]).mean(axis=0)
-    return "z" if all(d[2] > 2 * np.abs(d[:2]).max() for d in (rest, mean)) else "y"
-
-
-def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the least rotation that takes direction a to b; half a turn where they are opposite."""
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    axis, cosine = np.cross(a, b), a @ b
-    if cosine < -1 + 1e-9:
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+    return SkeletonPoses(places[shown_frames(len(places))], rest_of(motion)[1], motion.joint_names)
 
 
 def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int], quarter, axes) -> np.ndarray:
@@ -299,21 +223,14 @@ def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int]
         if j not in pairs or part not in {*LIMBS, "foot"}:
             continue
         end = f"{side} {LIMBS.get(part, 'toe')}"
-        ours, theirs = _bone(target, end, body.joints, None, j), _bone(source, end, motion.joints, motion.tips, pairs[j])
+        ours, theirs = bone(target, end, body.joints, None, j), bone(source, end, motion.joints, motion.tips, pairs[j])
         if part == "foot":
             align[j] = quarter
             if ours is not None and theirs is not None:
                 align[j] = quarter @ axes @ _foot_rotation(axes.T @ ours, axes.T @ quarter.T @ theirs) @ axes.T
         elif ours is not None and theirs is not None:
-            align[j] = _least_turn(align[j] @ ours, theirs) @ align[j]
+            align[j] = least_turn(align[j] @ ours, theirs) @ align[j]
     return align
-
-
-def _bone(of: Limbs, end: str, joints, tips, j: int) -> np.ndarray | None:
-    """Return the vector from a joint to its bone's end: the joint of that role, or the tip; None where neither is known."""
-    place = joints[of.roles[end]] if of.roles.get(end, j) != j else joints[j] if tips is None else tips[j]
-    bone = (place - joints[j]).astype(np.float64)
-    return bone if np.linalg.norm(bone) > 0 else None
 
 
 def _foot_rotation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
@@ -321,8 +238,8 @@ def _foot_rotation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     flat, other = ours * (1, 0, 1), theirs * (1, 0, 1)
     if np.linalg.norm(other) < 0.2 * np.linalg.norm(theirs) or np.linalg.norm(flat) == 0:
         return np.eye(3)  # straight down: the bone ends in the sole, and does not tell where the toes are
-    turn = _least_turn(flat, other)
-    apart = _least_turn(turn @ ours, theirs)
+    turn = least_turn(flat, other)
+    apart = least_turn(turn @ ours, theirs)
     return apart @ turn if np.trace(apart) < 1 + 2 * np.cos(np.pi / 4) else turn
 
 
@@ -341,7 +258,7 @@ def _leg_ratio(rest: np.ndarray, body: BodyRecord, source: Limbs, target: Limbs)
     ours, theirs = _leg_length(target, body.joints), _leg_length(source, rest)
     if not (np.isfinite(ours) and theirs > 0):
         ours, theirs = (
-            float(np.linalg.norm(x[_top(a)] - x[a.roles["hips"]]))
+            float(np.linalg.norm(x[top(a)] - x[a.roles["hips"]]))
             for x, a in ((body.joints, target), (rest, source))
         )  # fmt: skip
     if not (ours > 0 and theirs > 0):
@@ -349,7 +266,7 @@ def _leg_ratio(rest: np.ndarray, body: BodyRecord, source: Limbs, target: Limbs)
     return ours / theirs
 
 
-def _sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarray, axis: int, up) -> np.ndarray:
+def sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.ndarray, axis: int, up) -> np.ndarray:
     """Return how high (m) the lowest sole is above where soles are at rest, frame by frame; every few frames of a long motion.
 
     Heights are along the world's `axis` in motion and along the body's `up` at rest.

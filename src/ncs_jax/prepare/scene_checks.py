@@ -19,6 +19,7 @@ from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.scene.model import Model, local_rotations, pose_body, pose_rest
 from ncs_jax.scene.spec import Scene
 
@@ -150,9 +151,17 @@ def _motion(a: Assembly, name: str) -> Iterator[Risk]:
         yield from _inside(model, record.poses[frames], f"where the body alone carries it in {name}", DEEP, MANY, mend)
 
 
+def _postures(a: Assembly) -> Iterator[Risk]:
+    """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
+    world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
+    for name, record in a.motions.items():
+        for what, value, risk, mend in posture_faults(record, a.body, world) if a.body is not None else ():
+            yield Risk(what, f"{value} of {name}", risk, mend)
+
+
 def find_risks(a: Assembly) -> list[Risk]:
     """Return all that puts a scene at risk, from its material, its mesh, its fit and its motions; none where it is safe."""
-    found = [*_material(a.scene), *_mesh(a)]
+    found = [*_postures(a), *_material(a.scene), *_mesh(a)]
     if a.model.surface is not None:
         joints = 1 if a.body is None else len(a.body.parents)
         found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out: ncs fit")

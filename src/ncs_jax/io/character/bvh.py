@@ -27,8 +27,8 @@ class Bvh:
         file: the path. joint_names: J names, root first; end sites are no joints. parents: (J,) int32, -1 for the root.
         offsets: (J, 3) from each joint's parent to the joint in the rest pose; the root's is its rest place.
         tips: (J, 3) from a joint to its end site; NaN where a joint has none. poses: (T, J, 3) local rotations since rest, axis
-            times angle. positions: (T, 3) of the root. fps: frames per second. notes: where the file is not as it should be,
-            and how it was read.
+            times angle. positions: (T, 3) of the root. fps: frames per second. moved: (T, 3), what the position channels of
+            another joint say, see `moving_root`. notes: where the file is not as it should be, and how it was read.
     """
 
     file: Path
@@ -39,6 +39,7 @@ class Bvh:
     poses: np.ndarray
     positions: np.ndarray
     fps: float
+    moved: dict[int, np.ndarray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
@@ -70,7 +71,7 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
     joints, note = _one_skeleton(file, every, root)
     offsets = np.array([joint.offset for joint in joints])
     poses = np.zeros((len(values), len(joints), 3))
-    positions = np.broadcast_to(offsets[0], (len(values), 3)).copy()
+    moved: dict[int, np.ndarray] = {0: np.broadcast_to(offsets[0], (len(values), 3)).copy()}
     for j, joint in enumerate(joints):
         own = values[:, joint.column : joint.column + len(joint.channels)]
         turning = [c for c, (kind, _) in enumerate(joint.channels) if kind == "rotation"]
@@ -80,26 +81,12 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
             turns = Rotation.from_euler(axes, np.where(known[:, None], own[:, turning], 0), degrees=True).as_rotvec()
             poses[:, j] = np.where(known[:, None], turns, np.nan)
         for (kind, axis), value in zip(joint.channels, own.T, strict=True):
-            if kind == "rotation":
-                continue
-            if j == 0:
-                positions[:, axis] = value
-            elif _range(value) > 0.01 * np.linalg.norm(offsets, axis=1).max():
-                raise InputError(
-                    "bones of fixed length expected", file=file, field=f"joint {joint.name}",
-                    value=f"its {'XYZ'[axis]}position varies by {_range(value):.3g}",
-                    mend="export positions for the root only",
-                )  # fmt: skip
+            if kind == "position":
+                moved.setdefault(j, np.broadcast_to(offsets[j], (len(values), 3)).copy())[:, axis] = value
     return Bvh(
         file, tuple(joint.name for joint in joints), np.array([joint.parent for joint in joints], np.int32), offsets,
-        np.array([joint.tip for joint in joints]), poses, positions, fps, (*note, *notes),
+        np.array([joint.tip for joint in joints]), poses, moved.pop(0), fps, moved, (*note, *notes),
     )  # fmt: skip
-
-
-def _range(values: np.ndarray) -> float:
-    """Return how far apart the finite ones of some values are."""
-    known = values[np.isfinite(values)]
-    return float(np.ptp(known)) if len(known) else 0.0
 
 
 def _one_skeleton(file: Path, joints: list[_Joint], root: str) -> tuple[list[_Joint], tuple[str, ...]]:

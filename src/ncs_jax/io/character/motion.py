@@ -11,6 +11,7 @@ from ncs_jax.io.character.bvh import read_bvh
 from ncs_jax.io.character.fbx_character import fbx_motion
 from ncs_jax.io.character.gltf_character import gltf_motion
 from ncs_jax.io.character.motion_table import FIELDS, chosen_frames, table_motion
+from ncs_jax.io.character.moving_root import bvh_from_moving_root
 from ncs_jax.io.character.rig import split_clip
 from ncs_jax.io.records import MotionRecord
 from ncs_jax.io.tables.hdf5 import read_hdf5
@@ -53,8 +54,7 @@ def read_motion(
             that is no rotation, there is no frame, or the frame rate is not above 0.
     """
     name, clip = split_clip(path)
-    suffix = Path(name).suffix.lower()
-    if suffix not in FORMATS:
+    if (suffix := Path(name).suffix.lower()) not in FORMATS:
         raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
     if not 0 < scale < 1e6:
         raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
@@ -74,7 +74,7 @@ def read_motion(
 
 def _bvh_motion(path: str, root: str) -> MotionRecord:
     """Return the motion of a .bvh in the file's own unit."""
-    bvh = read_bvh(path, root)
+    bvh = bvh_from_moving_root(read_bvh(path, root))
     joints = bvh.offsets.copy()
     for j, parent in enumerate(bvh.parents[1:], 1):
         joints[j] += joints[parent]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.hierarchy import by_depth, lowest_common, nearest_parents, path_to_root
+from ncs_jax.io.character.moving_root import SLIDE, SPARE, check_slides, moving_root
 from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import LARGEST
@@ -26,6 +27,7 @@ __all__ = [
     "clip_named",
     "first_that_moves",
     "motion_of",
+    "quarter_turns",
     "rig_from",
     "split_clip",
     "unique_names",
@@ -258,7 +260,7 @@ def _upright(matrices: np.ndarray, share: np.ndarray, armature: np.ndarray) -> n
     """
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     turn = np.einsum("j,jab->ab", share, left @ right)
-    candidates = _quarter_turns(np.sign(np.linalg.det(matrices[0, :3, :3])))
+    candidates = [q * np.sign(np.linalg.det(matrices[0, :3, :3])) for q in quarter_turns()]
     left, _, right = np.linalg.svd(armature[:3, :3])
     candidates.append(left @ right)
     out = np.eye(4)
@@ -266,16 +268,9 @@ def _upright(matrices: np.ndarray, share: np.ndarray, armature: np.ndarray) -> n
     return out
 
 
-def _quarter_turns(sign: float) -> list[np.ndarray]:
-    """Return the 24 rotations that map axes to axes, or the 24 that also mirror."""
-    found = []
-    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
-        for signs in np.ndindex(2, 2, 2):
-            q = np.zeros((3, 3))
-            q[np.arange(3), order] = 1 - 2 * np.array(signs)
-            if np.linalg.det(q) * sign > 0:
-                found.append(q)
-    return found
+def quarter_turns() -> np.ndarray:
+    """Return the 24 rotations (24, 3, 3) that take axes of coordinates to axes of coordinates, the identity first."""
+    return np.round(Rotation.create_group("O").as_matrix())
 
 
 def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -336,15 +331,16 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
     """Return the motion of joints that move as a file says: local rotations since rest, in the joints' own rest frames.
 
     Since rest a joint has turned in the world by G_j = A_j B_j^-1, its matrix now times the inverse of its bind matrix. In its
-    own frame, seen from its parent, that is R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation.
+    own frame, seen from its parent, that is R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation. A root above the
+    hips may stand still or carry a part of the path, and bones may slide a little about their mean, see `moving_root`.
 
     Args:
         rig: the joints. times: begin and end, s, and frames per second. worlds: gives, for times (n,) in s, the matrices
             (n, J, 4, 4) joint to world.
 
     Raises:
-        InputError: the motion lasts an hour or more, a joint scales by more than 1 %, or a joint leaves its place on its parent
-            by more than 1 cm. Less than that is ignored. Joints that move no vertex may do both.
+        InputError: the motion lasts an hour or more, a joint scales by more than 1 %, or a joint leaves its mean place on its
+            parent by more than 1 cm and a twentieth of the bone. Joints that move no vertex may do both.
     """
     begin, end, fps = times
     count = int(np.floor((end - begin) * fps + 1e-3)) + 1 if end - begin < HOUR else 0
@@ -353,21 +349,54 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
             "an animation of less than an hour expected", file=rig.file, field="animations", value=f"{end - begin:.6g} s",
             mend="cut it into several",
         )  # fmt: skip
-    rest, joints = _rest_rotations(rig), rig.binds[:, :3, 3]
-    back, above = np.linalg.pinv(rig.binds), rig.parents[1:]
-    turned, moved = [], []
+    back, turned, placed = np.linalg.pinv(rig.binds), [], []
     for first in range(0, count, BLOCK):
         at = worlds(begin + np.arange(first, min(first + BLOCK, count)) / fps)
-        world = _rotations(rig, (at @ back)[..., :3, :3], first)
-        place = at[..., :3, 3]
-        bones = np.einsum("tjab,jb->tja", world[:, above], joints[1:] - joints[above])
-        _check_bones(rig, place[:, 1:] - place[:, above] - bones, first)
-        local = world.copy()
-        local[:, 1:] = np.swapaxes(world[:, above], -1, -2) @ world[:, 1:]
-        own = np.swapaxes(rest, -1, -2) @ local @ rest
-        turned.append(Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(own.shape[:3]))
-        moved.append(place[:, 0] - joints[0])
-    return MotionRecord(np.concatenate(turned), np.concatenate(moved), fps, rig.names, joints, rig.parents, rest_rotations=rest)
+        turned.append(_rotations(rig, (at @ back)[..., :3, :3], first))
+        placed.append(at[..., :3, 3])
+    world, place = np.concatenate(turned), np.concatenate(placed)
+    joints, kept, notes = _settled(rig, world, place)
+    rest, parents = _rest_rotations(rig)[kept], nearest_parents(rig.parents, kept)
+    local = world[:, kept]
+    local[:, 1:] = np.swapaxes(local[:, parents[1:]], -1, -2) @ local[:, 1:]
+    own = np.swapaxes(rest, -1, -2) @ local @ rest
+    poses = Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(own.shape[:3])
+    names = tuple(rig.names[j] for j in kept)
+    return MotionRecord(poses, place[:, kept[0]] - joints[0], fps, names, joints, parents, rest_rotations=rest, notes=notes)
+
+
+def _settled(rig: Rig, world: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, list[int], tuple[str, ...]]:
+    """Return rest joints whose bones are as long as they are on average, the numbers of the joints that are kept, and notes.
+
+    A bone keeps its place in the bind pose where it is within `GIVE` of it.
+    """
+    joints, parents = rig.binds[:, :3, 3].copy(), rig.parents
+    seen = np.einsum("tjba,tjb->tja", world[:, parents[1:]], place[:, 1:] - place[:, parents[1:]])
+    if not np.isfinite(place).all():
+        t, j = (int(i) for i in np.argwhere(~np.isfinite(place).all(axis=-1))[0])
+        where = f"animation, frame {t}, joint {rig.names[j]}"
+        raise InputError("finite numbers expected", file=rig.file, field=where, mend="export it again")
+    bones, bind = seen.mean(axis=0), joints[1:] - joints[parents[1:]]
+    off = np.concatenate([[0.0], np.linalg.norm(seen - bones, axis=-1).max(axis=0)])
+    length = np.concatenate([[0.0], np.linalg.norm(bones, axis=-1)])
+    wrong = rig.used & (off > np.maximum(GIVE, SLIDE * length))
+    own = np.asarray(rig.weights.any(axis=0))
+    if not len(rig.weights):
+        own = (np.abs(world - world[:1]) > 0.01).any(axis=(0, 2, 3)) & ~wrong
+    kept = moving_root(parents, wrong, own, 0 if len(rig.weights) else SPARE)
+    others = kept[1:]
+    slides = np.where(rig.used & (off > GIVE), off, 0)
+    notes = check_slides(rig.file, [rig.names[j] for j in others], slides[others], length[others], wrong[others])
+    near = np.linalg.norm(bones - bind, axis=-1) <= GIVE
+    changed = [j for j in others if rig.used[j] and not near[j - 1]]
+    for j in others:
+        joints[j] = joints[parents[j]] + (bones[j - 1] if j in changed else bind[j - 1])
+    if changed:
+        notes = (*notes, f"{len(changed)} bones are longer or shorter than in the bind pose, as {rig.names[changed[0]]}")
+    if kept[0]:
+        gone = ", ".join(n for j, n in enumerate(rig.names) if j not in kept)
+        notes = (f"{rig.names[kept[0]]} carries the path, so it is the root; left out: {gone[:200]}", *notes)
+    return joints[kept], kept, notes
 
 
 def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
@@ -389,15 +418,3 @@ def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
             value=f"scaled by {float(scale[t, j]):.4g}, or sheared", mend="apply scale, and animate rotations only",
         )  # fmt: skip
     return np.where(bad[..., None, None], np.eye(3), turns)
-
-
-def _check_bones(rig: Rig, off: np.ndarray, first: int) -> None:
-    """Raise an InputError where a used joint is off (T, J - 1, 3), m, from its place on its parent."""
-    far = np.where(rig.used[1:], np.linalg.norm(off, axis=-1), 0)
-    if far.max(initial=0) > GIVE or not np.isfinite(far).all():
-        t, j = (int(i) for i in np.unravel_index(np.argmax(np.where(np.isfinite(far), far, np.inf)), far.shape))
-        raise InputError(
-            "bones of fixed length expected, as in the bind pose", file=rig.file,
-            field=f"animation, frame {t + first}, joint {rig.names[j + 1]}", value=f"{far[t, j]:.3g} m from its place",
-            mend="animate only rotations, and translations of the root",
-        )  # fmt: skip

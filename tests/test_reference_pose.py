@@ -1,0 +1,272 @@
+"""Skeletons whose zero pose is no person: the same motion under other conventions drives the body to the same places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.prepare.motion_import import retarget_to_body
+from ncs_jax.prepare.posture_checks import posture_faults
+from ncs_jax.scene.spec import MotionSpec, packaged
+from tests.test_retarget import figure, forward
+
+FRAMES = 48
+
+
+@pytest.fixture(scope="module")
+def body() -> BodyRecord:
+    return io.read_body(packaged("body"))
+
+
+def walk(**options) -> MotionRecord:
+    """A figure that walks two steps with its arms down and its elbows bent, in m, upright on average."""
+    names, parents, joints, keys = figure("mixamo", **options)
+    phase = 2 * np.pi * np.arange(FRAMES) / 24
+    poses = np.zeros((FRAMES, len(names), 3))
+    for j, (side, part) in enumerate(keys):
+        sign = 1 if side == "left" else -1
+        swing = sign * np.sin(phase)
+        if part == "arm":
+            down = Rotation.from_rotvec([0, 0, -sign * 1.2])
+            poses[:, j] = (Rotation.from_rotvec(-0.4 * swing[:, None] * [1, 0, 0]) * down).as_rotvec()
+        poses[:, j, 1] += {"spine": 0.1, "hips": 0.08}.get(part, 0) * np.sin(phase)
+        poses[:, j, 1] += -sign * (0.5 + 0.2 * swing) * (part == "forearm")
+        poses[:, j, 0] += 0.4 * swing * (part == "thigh") + 0.2 * (1 + swing) * (part == "shin")
+        poses[:, j, 1] += 0.1 * np.sin(phase) * (part == "head")
+    path = np.linspace(0, 1, FRAMES)[:, None] * [0.1, 0, 1.5]
+    return MotionRecord(poses, path, 30.0, names, joints, parents)
+
+
+def told_since(motion: MotionRecord, turns: np.ndarray) -> MotionRecord:
+    """The same motion on a skeleton whose zero pose is the old one with joint j turned by (J, 3, 3) in the world."""
+    joints, parents = np.asarray(motion.joints), np.asarray(motion.parents)
+    world, places = forward(joints, parents, motion)
+    rest = joints.copy()
+    new = world @ np.swapaxes(turns, 1, 2)
+    for j, p in enumerate(parents[1:], 1):
+        rest[j] = rest[p] + turns[p] @ (joints[j] - joints[p])
+    local = new.copy()
+    local[:, 1:] = np.swapaxes(new[:, parents[1:]], -1, -2) @ new[:, 1:]
+    poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(motion.poses.shape)
+    out = replace(motion, poses=poses, joints=rest)
+    np.testing.assert_allclose(forward(rest, parents, out)[1], places, atol=1e-9)
+    return out
+
+
+def along(motion: MotionRecord, axis: int) -> np.ndarray:
+    """Turns that lay one axis of every joint along its bone in the zero pose; of the trunk's, to the nearest quarter."""
+    joints, parents, names = np.asarray(motion.joints), np.asarray(motion.parents), motion.joint_names
+    out = np.broadcast_to(np.eye(3), (len(parents), 3, 3)).copy()
+    chosen = np.eye(3)[axis]
+    for j in range(len(parents)):
+        below = [k for k in range(len(parents)) if parents[k] == j]
+        middle = [k for k in below if not any(s in names[k] for s in ("Left", "Right"))]
+        bone = joints[(middle or below)[0]] - joints[j] if below else np.array([0, 1.0, 0])
+        if not any(s in names[j] for s in ("Left", "Right")):
+            bone = np.array([0, 1.0, 0])
+        out[j] = Rotation.align_vectors(chosen[None], bone[None])[0].as_matrix()
+        if middle or "Head" in names[j]:  # the trunk's left stays along an axis
+            out[j] = np.eye(3)[[1, 2, 0]] if axis == 0 else np.eye(3) if axis == 1 else np.eye(3)[[2, 0, 1]]
+    return out
+
+
+def driven(motion: MotionRecord, body: BodyRecord, **options) -> tuple[np.ndarray, np.ndarray, MotionRecord]:
+    """World rotations and places of the body's joints, by the independent computation of `forward`."""
+    moved = retarget_to_body(motion, body, MotionSpec(**options))
+    return *forward(body.joints, body.parents, moved), moved
+
+
+def apart(one, other) -> tuple[np.ndarray, float]:
+    """The largest angle in degrees of each joint (J,), and the largest distance of places, m."""
+    turn = np.swapaxes(one[0], -1, -2) @ other[0]
+    angle = np.degrees(Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude()).reshape(turn.shape[:2]).max(axis=0)
+    return angle, float(np.abs(one[1] - other[1]).max())
+
+
+CONVENTIONS = {
+    "x along the bone": lambda m, rng: along(m, 0),
+    "y along the bone": lambda m, rng: along(m, 1),
+    "z along the bone": lambda m, rng: along(m, 2),
+    "axes of its own for every joint": lambda m, rng: Rotation.random(len(m.parents), rng=rng).as_matrix(),
+}
+
+
+@pytest.mark.parametrize("size", [1.0, 100.0, 1 / 0.0254], ids=["m", "cm", "inch"])
+@pytest.mark.parametrize("convention", list(CONVENTIONS))
+def test_a_zero_pose_that_is_no_person_is_understood(rng, body, convention, size):
+    """Places agree to 1 mm, trunk, collars and feet to 2 degrees; the packaged body has helper joints, all of them compared."""
+    motion = walk(size=size)
+    motion = replace(motion, translation=motion.translation * size)
+    other = told_since(motion, CONVENTIONS[convention](motion, rng))
+    ours, theirs = driven(motion, body), driven(other, body)
+    angle, far = apart(ours, theirs)
+    trunk = [
+        j for j, n in enumerate(body.joint_names) if any(w in n for w in ("Hips", "Spine", "Back", "Neck", "Shoulder", "Foot"))
+    ]
+    assert angle[trunk].max() < 2, dict(zip(body.joint_names, angle.round(1), strict=True))
+    assert far < 0.001 + 0.035 * 0.6 * (angle[trunk].max() > 0.1)
+    assert any("reference pose" in note for note in theirs[2].notes)
+    wrong = apart(ours, driven(other, body, rest="zero"))
+    assert wrong[0][trunk].max() > 30, "the zero pose alone would do, so this shows nothing"
+
+
+@pytest.mark.parametrize("frame", [0, 3])
+@pytest.mark.parametrize("heading", [0, 90, 180, 37])
+def test_a_pose_among_the_first_frames_is_found(rng, body, frame, heading):
+    """The T-pose may stand anywhere among the first frames and look anywhere; the scene may name it as well."""
+    motion = walk()
+    poses = np.concatenate([motion.poses[:frame], np.zeros((1, *motion.poses.shape[1:])), motion.poses])
+    poses[frame, 0] = [0, np.radians(heading), 0]
+    moved = np.concatenate([motion.translation[:frame], np.zeros((1, 3)), motion.translation])
+    motion = replace(motion, poses=poses, translation=moved)
+    other = told_since(motion, Rotation.random(len(motion.parents), rng=rng).as_matrix())
+    ours, theirs = driven(motion, body, frames=(0,)), driven(other, body, frames=(0,))
+    assert apart(ours, theirs)[0].max() < 1e-3 and f"frame {frame}, a T-pose" in " ".join(theirs[2].notes)
+    named = driven(other, body, frames=(0,), rest=str(frame))
+    assert apart(theirs, named)[0].max() < 1e-6 and "motion.rest" in " ".join(named[2].notes)
+
+
+@pytest.mark.parametrize("droop", [0.0, 0.7, np.pi / 2], ids=["T", "A", "N"])
+def test_a_person_at_rest_stays_as_it_is(body, droop):
+    motion = walk(droop=droop)
+    auto, zero = (retarget_to_body(motion, body, MotionSpec(rest=rest)) for rest in ("auto", "zero"))
+    np.testing.assert_array_equal(auto.poses, zero.poses)
+    assert auto.notes == zero.notes
+
+
+def test_what_has_no_reference_pose_is_refused(rng, body):
+    motion = walk()
+    lying = replace(motion, poses=motion.poses.copy())
+    lying.poses[:, 0] = (Rotation.from_rotvec([np.pi / 2, 0, 0]) * Rotation.from_rotvec(motion.poses[:, 0])).as_rotvec()
+    other = told_since(lying, Rotation.random(len(motion.parents), rng=rng).as_matrix())
+    with pytest.raises(InputError, match=r"motion.rest: .*upright frames"):
+        retarget_to_body(other, body, MotionSpec(up="y"))
+    for rest, words in (("T-pose", '"auto", "zero" or the number'), ("99", "a frame below 48")):
+        with pytest.raises(InputError, match=f"motion.rest: {words}"):
+            retarget_to_body(other, body, MotionSpec(rest=rest))
+
+
+def standing_along_z(motion: MotionRecord) -> MotionRecord:
+    turn = Rotation.from_rotvec([np.pi / 2, 0, 0])
+    poses = motion.poses.copy()
+    poses[:, 0] = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    home = np.asarray(motion.joints)[0]
+    return replace(motion, poses=poses, translation=turn.apply(home + motion.translation) - home)
+
+
+def test_a_rest_along_y_and_a_motion_along_z(body):
+    """The walk stands up by itself; someone who lies, all the time or for a while, is left to lie, and it is said."""
+    motion = walk()
+    ours, theirs = driven(motion, body), driven(standing_along_z(motion), body)
+    assert apart(ours, theirs)[0].max() < 1e-3 and not list(posture_faults(theirs[2], body, "y"))
+    bed = standing_along_z(replace(motion, translation=np.zeros((FRAMES, 3)), poses=0.1 * motion.poses))
+    bed = replace(bed, translation=np.broadcast_to([0, -0.8, 3.0], (FRAMES, 3)))
+    yoga = replace(bed, poses=np.concatenate([bed.poses, motion.poses]), translation=np.zeros((2 * FRAMES, 3)))
+    for record, told in ((bed, True), (yoga, False)):
+        moved = retarget_to_body(record, body, MotionSpec())
+        assert not any("turned from" in note for note in moved.notes)
+        faults = [f for f in posture_faults(moved, body, "y") if f[0] == "the character lies down"]
+        assert bool(faults) == told and all("motion.up" in f[3] for f in faults)
+
+
+def test_postures_that_nobody_holds_are_told(rng, body):
+    motion = walk()
+    assert not list(posture_faults(driven(motion, body)[2], body, "y"))
+    wrong = driven(told_since(motion, along(motion, 0)), body, rest="zero")[2]
+    told = {what: mend for what, _, _, mend in posture_faults(wrong, body, "y")}
+    assert any("collar bone" in what for what in told) and all("motion." in mend for mend in told.values())
+    right = retarget_to_body(motion, body, MotionSpec())
+    floats = replace(right, translation=right.translation + np.linspace(0, 3, FRAMES)[:, None] ** 2 * [0, 1, 0], fps=10.0)
+    assert [f[0] for f in posture_faults(floats, body, "y")] == ["feet that float or sink"]
+    crossed = right.poses.copy()
+    names = list(body.joint_names)
+    for side in ("Left", "Right"):  # the elbow goes to the middle of the trunk
+        arm, elbow = (names.index(f"{side}{part}") for part in ("Arm", "ForeArm"))
+        goal = body.joints[names.index("Spine")] + [0, 0.1, 0] - body.joints[arm]
+        bone = body.joints[elbow] - body.joints[arm]
+        crossed[:, arm] = Rotation.align_vectors(goal[None], bone[None])[0].as_rotvec()
+    assert "arms inside the trunk" in [f[0] for f in posture_faults(replace(right, poses=crossed), body, "y")]
+
+
+def bvh_text(motion: MotionRecord, positions: dict[str, np.ndarray], hips: np.ndarray | None = None) -> str:
+    """A .bvh in which some joints have position channels (T, 3); with `hips` a still or moving root (T, 3) stands above."""
+    joints, parents, names = np.asarray(motion.joints), np.asarray(motion.parents), motion.joint_names
+    lines, rows = ["HIERARCHY"], []
+    angles = np.degrees(Rotation.from_rotvec(motion.poses.reshape(-1, 3)).as_euler("ZXY").reshape(motion.poses.shape))
+
+    def write(j: int, word: str) -> None:
+        offset = joints[j] - (joints[parents[j]] if parents[j] >= 0 else 0)
+        kinds = "Xposition Yposition Zposition " if names[j] in positions else ""
+        lines.extend([f"{word} {names[j]}", "{", f"OFFSET {offset[0]:.9f} {offset[1]:.9f} {offset[2]:.9f}"])
+        lines.append(f"CHANNELS {6 if kinds else 3} {kinds}Zrotation Xrotation Yrotation")
+        rows.extend([positions[names[j]]] if kinds else [])
+        rows.append(angles[:, j])
+        below = [k for k in range(len(parents)) if parents[k] == j]
+        for k in below:
+            write(k, "JOINT")
+        lines.extend([] if below else ["End Site", "{", "OFFSET 0 0.1 0", "}"])
+        lines.append("}")
+
+    if hips is None:
+        write(0, "ROOT")
+    else:
+        lines.extend(
+            ["ROOT root", "{", "OFFSET 0 0 0", "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"]
+        )
+        rows.extend([hips, np.zeros((FRAMES, 3))])
+        write(0, "JOINT")
+        lines.append("}")
+    values = np.concatenate(rows, axis=1)
+    body = "\n".join(" ".join(f"{v:.9f}" for v in row) for row in values)
+    return "\n".join(lines) + f"\nMOTION\nFrames: {FRAMES}\nFrame Time: 0.0333333\n{body}\n"
+
+
+def test_a_root_above_the_hips_and_bones_that_slide(tmp_path, body):
+    """Root still or moving, channels in place of the OFFSET or added to it; 3 % of sliding are told, 30 refused."""
+    motion = walk()
+    home, hips = np.asarray(motion.joints)[0], motion.joint_names[0]
+    here, half = home + motion.translation, motion.translation * [1, 0, 0.5]
+    files = {
+        "plain": bvh_text(motion, {hips: here}),
+        "still": bvh_text(motion, {hips: here}, np.zeros((FRAMES, 3))),
+        "parts": bvh_text(motion, {hips: here - half}, half),
+        "above": bvh_text(motion, {hips: np.broadcast_to(home, here.shape)}, motion.translation),
+        "added": bvh_text(motion, {hips: motion.translation}, np.zeros((FRAMES, 3))),
+    }
+    knee = motion.joint_names[[k[1] for k in figure("mixamo")[3]].index("shin")]
+    bone = np.array([0, -0.42, 0])
+    for name, share in (("slides", 0.03), ("stretches", 0.3)):
+        files[name] = bvh_text(motion, {hips: here, knee: bone * (1 + share * np.sin(np.arange(FRAMES)))[:, None]})
+    found = {}
+    for name, text in files.items():
+        (tmp_path / f"{name}.bvh").write_text(text)
+        if name == "stretches":
+            with pytest.raises(InputError, match=f"joint {knee}: bones of fixed length expected"):
+                io.read_motion(tmp_path / f"{name}.bvh")
+        else:
+            found[name] = driven(io.read_motion(tmp_path / f"{name}.bvh"), body)
+    for name, one in found.items():
+        angle, far = apart(found["plain"], one)
+        assert angle.max() < 1e-3 and far < (0.002 if name == "slides" else 1e-5), name
+    assert "bones slide" in " ".join(found["slides"][2].notes) and "carries the path" in " ".join(found["still"][2].notes)
+
+
+def test_hips_and_spine_beside_each_other(body):
+    """A root carries a pelvis with the legs and, beside it, a waist with the spine, as Character Creator writes it."""
+    motion = walk()
+    names, parents = motion.joint_names, np.asarray(motion.parents)
+    middle = np.asarray(motion.joints)[:1]
+    above = np.concatenate([[-1], [0], np.where(parents[1:] == 0, 1, parents[1:] + 1)]).astype(np.int32)
+    spine = 1 + next(j for j, n in enumerate(names) if n.endswith(":Spine"))
+    above[spine] = 0
+    poses = np.concatenate([motion.poses[:, :1], np.zeros((FRAMES, 1, 3)), motion.poses[:, 1:]], axis=1)
+    joints = np.concatenate([middle, np.asarray(motion.joints)])
+    other = replace(motion, joint_names=("Base_Root", *names), parents=above, joints=joints, poses=poses)
+    angle, far = apart(driven(motion, body), driven(other, body))
+    assert angle.max() < 1e-3 and far < 1e-5
