@@ -18,6 +18,7 @@ from PIL import Image
 from ncs_jax import io
 from ncs_jax.cli import check, main
 from ncs_jax.io import MotionRecord
+from ncs_jax.prepare.joint_names import listed
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 from ncs_jax.view.character import body_vertices
@@ -340,21 +341,21 @@ def test_check_tells_motions_that_match_alike_once(capsys):
     [
         (
             "Hips mixamorig:LeftHandThumb1 mixamorig:RightHandPinky3 mixamorig:LeftHand",
-            "Hips, mixamorig:LeftHand, 2 of fingers",
+            "Hips, mixamorig:LeftHand and 2 finger, face or helper joints",
         ),
-        ("pelvis left_index1 left_middle2 jaw left_eye_smplhf head", "pelvis, head, 2 of fingers, 2 of the face"),
-        ("LThumb LeftFingerBase LeftHandFinger1 LeftHand Head", "LeftHand, Head, 3 of fingers"),
-        ("thumb_01_l pinky_metacarpal_r hand_l foot_l", "hand_l, foot_l, 2 of fingers"),
-        ("Tongue01 UpperTeeth lEye rEye LeftToeBase LeftFoot", "LeftToeBase, LeftFoot, 4 of the face"),
+        ("pelvis left_index1 left_middle2 jaw left_eye_smplhf head", "pelvis, head and 4 finger, face or helper joints"),
+        ("LThumb LeftFingerBase LeftHandFinger1 LeftHand Head", "LeftHand, Head and 3 finger, face or helper joints"),
+        ("thumb_01_l pinky_metacarpal_r hand_l foot_l", "hand_l, foot_l and 2 finger, face or helper joints"),
+        ("Tongue01 UpperTeeth lEye rEye LeftToeBase LeftFoot", "LeftToeBase, LeftFoot and 4 finger, face or helper joints"),
         (
             "CC_Base_JawRoot CC_Base_Teeth01 CC_Base_L_Index1 CC_Base_L_Forearm",
-            "CC_Base_L_Forearm, 1 of fingers, 2 of the face",
+            "CC_Base_L_Forearm and 3 finger, face or helper joints",
         ),
         ("0 1 2", "0, 1, 2"),
     ],
 )
 def test_check_counts_fingers_and_parts_of_the_face(names, expected):
-    assert check._without_small(names.split()) == expected
+    assert listed(names.split(), {name: name for name in names.split()}) == expected
 
 
 def test_train_says_where_it_is(run_folder, tmp_path, capsys):

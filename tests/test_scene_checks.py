@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,15 @@ def test_motion_with_a_jump_and_a_flip(tmp_path, plain_jax):
     whats = {f.what: f for f in found(tmp_path, motion=motion)}
     assert "frame 12" in whats["jump within a frame"].value and "2.0" in whats["jump within a frame"].value
     assert "frame 1" in whats["turn within a frame"].value and "joint 1" in whats["turn within a frame"].value
+
+
+def test_a_limb_that_nothing_drives_is_said_first(tmp_path, plain_jax):
+    assembly = assemble(load_scene(write_scene(tmp_path, SCENE)))
+    (name, record), mend = *assembly.motions.items(), 'motion.joints = { "x" = "LeftArm" }'
+    lame = replace(assembly, motions={name: replace(record, undriven={"left upper arm": mend})})
+    first, *rest = find_risks(lame)
+    assert (first.what, first.value, first.mend) == (name, "left upper arm is driven by nothing", mend)
+    assert [risk.what for risk in rest] == ["time step of a recurrence"]
 
 
 def test_garment_inside_the_body(tmp_path, plain_jax):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
@@ -20,11 +20,6 @@ __all__ = ["add_commands", "check"]
 
 DRAWN = 4  # motions in the picture, at most
 NAMED = 6  # motions of a group that are named, at most
-SMALL = {  # joints that are counted and not named, by the plain words of their names
-    "of fingers": r"(?:hand|f|l|r)?(?:thumb|index|middle|mid|ring|pinky|little|finger|carpal|metacarpal|inhand)[a-z]*\d*",
-    "of toes": r"(?:foot)?(?:bigtoe|indextoe|midtoe|ringtoe|pinkytoe|smalltoe|toe)\d+",
-    "of the face": r"(?:face|up|low|upper|lower|in|out)*(?:tongue|teeth|tooth|jaw|eye|lip|brow|cheek|nose|ear|chin)[a-z]*\d*",
-}
 
 
 def add_commands(commands) -> None:
@@ -76,6 +71,7 @@ def _tell_scene(assembly: Assembly) -> None:
     """Print what the garment, the body and the physics are."""
     from ncs_jax.energies.terms import NAMES
     from ncs_jax.prepare.garment_checks import summarise_surface
+    from ncs_jax.prepare.joint_names import listed
 
     model, mesh = assembly.model, assembly.model.garment.mesh
     names = assembly.body.joint_names if assembly.body is not None else ()
@@ -95,25 +91,10 @@ def _tell_scene(assembly: Assembly) -> None:
         _tell("body", f"{len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
         _tell("over", f"{name}: {len(layer.rest)} vertices")
-    _tell("joints", _without_small(joints))
+    _tell("joints", listed(joints, {name: name for name in joints}))
     if len(model.garment.pins):
         _tell("pins", f"{len(model.garment.pins)} vertices of the group {assembly.scene.garment.pins}")
     _tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
-
-
-def _without_small(names: Iterable[str]) -> str:
-    """Return names of joints in a list, those of fingers, toes and the face only counted."""
-    from ncs_jax.prepare.joint_names import side_and_rest
-
-    named, counted = [], dict.fromkeys(SMALL, 0)
-    for name in names:
-        word = side_and_rest(name)[1]
-        kind = next((k for k, pattern in SMALL.items() if re.fullmatch(pattern, word)), None)
-        if kind is None:
-            named.append(name)
-        else:
-            counted[kind] += 1
-    return ", ".join([*named, *(f"{count} {kind}" for kind, count in counted.items() if count)])
 
 
 def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:

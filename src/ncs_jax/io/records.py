@@ -83,6 +83,7 @@ class MotionRecord:
         rest_rotations: (J, 3, 3) as in a body: the axes that the poses are along; None: the world's. up: the axis of the world
             that points up, where the format says so, else "". notes: what was done so that the motion drives the body.
         source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
+        undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
     """
 
     poses: np.ndarray
@@ -96,6 +97,7 @@ class MotionRecord:
     up: str = ""
     notes: tuple[str, ...] = ()
     source: SkeletonPoses | None = None
+    undriven: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,42 +1,21 @@
-"""Joints told by their names: the conventions of CMU, MakeHuman, Poser, SMPL, Mixamo, Blender, Unreal and Biped."""
+"""What the joints of a skeleton are: limbs by their names, see `joint_words`, by what hangs on what, and by their shape."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
+
+import numpy as np
 
 from ncs_jax.io.character.hierarchy import path_to_root
+from ncs_jax.prepare.joint_shape import limbs_by_shape
+from ncs_jax.prepare.joint_words import EITHER, MIDDLE, ROLES, Name, read_names
 
-__all__ = ["Limbs", "anatomy", "pair", "side_and_rest"]
+__all__ = ["Limbs", "anatomy", "listed", "pair", "propose", "side_and_rest", "undriven"]
 
-PREFIX = re.compile(
-    r"^(mixamorig\d*[_\-. :]*|(j[_ ]?bip([_ ]c(?=[_ ]))?|bip\d+|def|org|valvebiped|cc[_ ]base|[mf][_ ]avg)[_\-. :]+)", re.I
-)
-PART = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-HIPS = ("pelvis", "hips", "hip", "spinebase", "root")  # the first that is there
-WORDS = {
-    "clavicle": ("collar", "collarbone", "clavicle", "innershoulder", "shouldergirdle"),
-    "arm": ("arm", "upperarm", "uparm", "shldr"),
-    "forearm": ("forearm", "lowerarm", "lowarm", "elbow"),
-    "hand": ("wrist",),
-    "hip joint": ("hipjoint", "buttock"),
-    "thigh": ("upleg", "upperleg", "thigh"),
-    "shin": ("shin", "knee", "calf", "lowerleg", "lowleg"),
-    "foot": ("ankle",),
-    "toe": ("toe", "toes", "toebase", "ball", "toe0"),
-}
-ROLES = {word: role for role, words in WORDS.items() for word in words}
-# The role of these words depends on what else the side has. Each: the role alone, the rival role, the role beside the rival.
-EITHER = {
-    "shoulder": ("arm", "arm", "clavicle"),
-    "hip": ("thigh", "thigh", "hip joint"),
-    "leg": ("shin", "shin", "thigh"),
-    "hand": ("hand", "hand", "palm"),
-    "foot": ("foot", "foot", "toe"),
-}
-FINGER = re.compile(r"(?:hand)?(thumb|index|middle|mid|ring|pinky|little|finger)(\d*)")
-SAME_FINGER = {"mid": "middle", "little": "pinky", "finger": "index"}  # MakeHuman's one finger is a BVH's index finger
+BONES = {"arm": "upper arm", "forearm": "forearm", "thigh": "thigh", "shin": "shin", "foot": "foot"}
+TOES = 3  # as many toes or more beside each other are single toes, and none of them is the ball of the foot
 
 
 @dataclass(frozen=True)
@@ -45,54 +24,160 @@ class Limbs:
 
     roles: the joint of each role, such as "hips", "head", "left forearm"; a joint without a role is listed by its plain name.
     spine: joints from above or beside the hips to the one that carries the arms. neck: joints from there to below the head.
+    shaped: roles that the names do not tell, but the skeleton's shape at rest.
     """
 
     roles: dict[str, int]
     spine: tuple[int, ...]
     neck: tuple[int, ...]
+    shaped: tuple[str, ...] = ()
 
 
-def anatomy(names: Sequence[str], parents: Sequence[int]) -> Limbs:
+class _Tree:
+    """What hangs on what: the path of each joint to the root, itself first, and how many joints hang on it."""
+
+    def __init__(self, parents: Sequence[int]):
+        self.above = [path_to_root(parents, j) for j in range(len(parents))]
+        self.load = np.zeros(len(parents), int)
+        for path in self.above:
+            self.load[path] += 1
+
+    def meet(self, *joints: int) -> int | None:
+        """Return the joint farthest from the root that carries all of these."""
+        return next((j for j in self.above[joints[0]] if self.carries(j, *joints)), None)
+
+    def carries(self, low: int, *joints: int) -> bool:
+        """Tell whether all of these hang on a joint, or are it."""
+        return all(low in self.above[j] for j in joints)
+
+    def between(self, low: int, high: int | None) -> tuple[int, ...]:
+        """Return the joints above `low` up to and with `high`; none where `high` does not hang on `low`."""
+        if high is None or low not in self.above[high]:
+            return ()
+        return tuple(reversed(self.above[high][: self.above[high].index(low)]))
+
+
+def anatomy(names: Sequence[str], parents: Sequence[int], joints: np.ndarray | None = None) -> Limbs:
     """Find out what the joints are: limbs by their names; spine and neck, whatever they are called, by what hangs on them.
 
-    Case, separators and a rig's prefixes do not matter. What a shoulder, hip, hand or foot means depends on what else its side
-    has: SMPL's shoulder bends the upper arm, Mixamo's carries it.
+    Limbs that the names do not tell are told by the places of the joints at rest, see `limbs_by_shape`, if they are given and
+    contradict no name.
+
+    Case, separators, numbering and what a rig puts before or behind all names do not matter. What a shoulder, hip, hand, foot
+    or leg means depends on what is above and below: SMPL's shoulder bends the upper arm, Mixamo's carries it. The hips are the
+    lowest joint of such a name, or of any, that carries both legs and the trunk.
 
     Args:
-        names: of the joints. parents: their parents, before them, -1 at the root.
+        names: of the joints. parents: their parents, before them, -1 at the root. joints: (J, 3) at rest, in any unit.
     """
-    plain = [side_and_rest(name) for name in names]
-    roles: dict[str, int] = {}
-    for j, (side, word) in enumerate(plain):
-        beside = {w for s, w in plain if s == side} if side else set()
-        roles.setdefault(f"{side} {_role(word, beside)}".strip(), j)
-    above = [path_to_root(parents, j) for j in range(len(names))]
+    read, tree = read_names(names), _Tree(parents)
+    named = _limb_roles(read, tree)
+    shaped = {} if joints is None else _missing(named, read, parents, joints)
+    roles = named | shaped
 
     def meet(*words: str) -> int | None:
-        """Return the joint farthest from the root that carries a role of both sides."""
+        """Return the joint that carries a role of both sides."""
         for word in words:
             if f"left {word}" in roles and f"right {word}" in roles:
-                both = [j for j in above[roles[f"left {word}"]] if j in above[roles[f"right {word}"]]]
-                return max(both, key=lambda j: len(above[j]), default=None)
+                return tree.meet(roles[f"left {word}"], roles[f"right {word}"])
         return None
 
     legs, chest, head = meet("hip joint", "thigh"), meet("clavicle", "arm"), roles.get("head")
-    hips = next((roles[w] for w in HIPS if w in roles), legs if legs is not None else 0)
-    if head is None:  # the last of the necks, or of what else goes on above the chest in the middle
-        rises = [j for word, j in roles.items() if word.startswith("neck")]
-        if not rises and chest is not None:
-            rises = [j for j in range(len(names)) if chest in above[j][1:] and not any(plain[i][0] for i in above[j])]
-        head = max(rises, key=lambda j: len(above[j]), default=None)
-        roles |= {} if head is None else {"head": head}
-    if chest is None and head is not None:
-        carried = [j for j in above[head] if not plain[j][1].startswith(("neck", "head"))]
-        chest = carried[0] if carried else None
-    common = next((j for j in above[hips] if chest is not None and j in above[chest]), hips)  # hips and spine may be siblings
-    spine = _between(common, chest, above)
-    neck = _between(chest if chest is not None else hips, head, above)[:-1]
-    trunk = {hips, *spine, *neck}
+    head = _last_of_neck(read, tree, chest, set(roles.values())) if head is None else head
+    roles |= {} if head is None else {"head": head}
+    if (top := head if chest is None else chest) is not None:  # Biped's arms hang on the neck
+        chest = next((j for j in tree.above[top] if not read[j].rest.startswith(("neck", "head"))), chest)
+    hips = _hips(read, tree, legs, chest)
+    spine = tree.between(hips, chest)
+    neck = tree.between(chest if chest is not None else hips, head)[:-1]
+    told, trunk = set(roles.values()), {hips, *spine, *neck}
+    for j, name in enumerate(read):
+        if j not in told:
+            roles.setdefault(f"{name.side} {name.finger or name.rest}".strip(), j)
     roles = {word: j for word, j in roles.items() if j not in trunk} | {"hips": hips}
-    return Limbs(roles, spine, neck)
+    return Limbs(roles, spine, neck, tuple(word for word in roles if word in shaped))
+
+
+def _missing(named: dict[str, int], read: list[Name], parents: Sequence[int], joints: np.ndarray) -> dict[str, int]:
+    """Return the roles of limbs that names lack and the shape has; none where no long bone is lacking, or a name says else."""
+    if all(f"{side} {role}" in named for side in ("left", "right") for role in ("arm", "forearm", "thigh", "shin")):
+        return {}
+    shape = limbs_by_shape(parents, joints, {j: name.side for j, name in enumerate(read) if name.side})
+    told = {j: word for word, j in named.items()}
+    if any(told.get(j, word) != word or named.get(word, j) != j for word, j in shape.items()):
+        return {}
+    return {word: j for word, j in shape.items() if word not in named}
+
+
+def _limb_roles(read: list[Name], tree: _Tree) -> dict[str, int]:
+    """Return the joint of each limb's role and the head: the one whose name is nearest to the word, then of most joints."""
+    found: dict[str, tuple[int, int, int]] = {}
+    for j, name in enumerate(read):
+        role = _role(j, read, tree)
+        if not role or (role in MIDDLE) != (name.side == ""):
+            continue
+        key = (name.order, -int(tree.load[j]), j)
+        found[f"{name.side} {role}".strip()] = min(key, found.get(f"{name.side} {role}".strip(), key))
+    return {role: j for role, (_, _, j) in found.items() if role != "hips"}
+
+
+def _role(j: int, read: list[Name], tree: _Tree) -> str:
+    """Return a joint's role; "" where its name has none. A word of EITHER is told by its side's joints above and below it."""
+    name = read[j]
+    beside = {i: n.word for i, n in enumerate(read) if i != j and n.side == name.side and n.word}
+    roles = {i: "" if word in EITHER else ROLES[word] for i, word in beside.items()}
+
+    def near(what: str, where: list[int] | None = None) -> bool:
+        """Tell whether a joint of this side has this word or role: anywhere, or among some."""
+        return any(what in (beside[i], roles[i]) and (where is None or i in where) for i in beside)
+
+    above, below = tree.above[j][1:], [i for i in beside if j in tree.above[i]]
+    match name.word if name.side else ROLES.get(name.word, ""):
+        case "shoulder":
+            arms = any(near(word) for word in ("arm", "shldr"))
+            return "arm" if not arms else "clavicle" if near("arm", below) else ""
+        case "hip":
+            return "thigh" if not near("thigh") else "hip joint" if near("thigh", below) else ""
+        case "hand":
+            return "palm" if near("hand", [i for i in above if read[i].word == "wrist"]) else "hand"
+        case "palm":
+            return "" if near("hand") else "hand"
+        case "foot":
+            return "toe" if near("foot", [i for i in above if read[i].word != "foot"]) else "foot"
+        case "leg" | "arm" as word:
+            upper, lower = ("thigh", "shin") if word == "leg" else ("arm", "forearm")
+            uppers = [i for i in beside if roles[i] == upper]
+            if uppers:
+                return lower if not near(lower) and any(i in above for i in uppers) else ""
+            again = any(beside[i] == word and read[i].number[:1] < name.number[:1] for i in above if i in beside)
+            return lower if again and not near(lower) else upper
+        case "toe" | "toes":
+            first = [i for i in tree.above[j] if i == j or roles.get(i) == "toe"][-1]
+            toes = [i for i in (j, *beside) if (i == j or roles[i] == "toe") and tree.above[i][1:2] == tree.above[first][1:2]]
+            return "" if len(toes) >= TOES else "toe"
+        case word:
+            return ROLES.get(word, "") if word not in EITHER else ""
+
+
+def _last_of_neck(read: list[Name], tree: _Tree, chest: int | None, limbs: set[int]) -> int | None:
+    """Return the head where none is called so: the last of the necks, or of what goes on above the chest before it branches."""
+    plain = {j for j, n in enumerate(read) if not n.side and not n.kind} - limbs
+    if rises := [j for j in plain if read[j].rest.startswith("neck")]:
+        return max(rises, key=lambda j: len(tree.above[j]))
+    last, above = None, [j for j in plain if chest in tree.above[j][1:2]]
+    while above and (last is None or len(above) == 1):
+        last = max(above, key=lambda j: tree.load[j])
+        above = [j for j in plain if last in tree.above[j][1:2]]
+    return last
+
+
+def _hips(read: list[Name], tree: _Tree, legs: int | None, chest: int | None) -> int:
+    """Return the lowest joint that is called hips and carries legs and trunk, else the lowest that does, called anything."""
+    carried = [j for j in (legs, chest) if j is not None]
+    called = [j for j, n in enumerate(read) if not n.side and ROLES.get(n.word) == "hips"]
+    called.sort(key=lambda j: (read[j].order, -len(tree.above[j])))
+    lowest = tree.meet(*carried) if carried and legs is not None else None
+    return next((j for j in called if tree.carries(j, *carried)), lowest if lowest is not None else next(iter(called), 0))
 
 
 def pair(source: Limbs, target: Limbs) -> dict[int, int]:
@@ -114,41 +199,41 @@ def _spread(i: int, count: int, length: int, lone: int) -> int:
     return lone if count == 1 else round(i * (length - 1) / (count - 1))
 
 
-def side_and_rest(name: str) -> tuple[str, str]:
-    """Return the side ("left", "right" or "") and the rest of a name, in small letters and without separators."""
-    parts = [p.lower() for p in PART.findall(PREFIX.sub("", re.split(r"[:|]", name)[-1]))]
-    parts = [str(int(p)) if p.isdigit() else p for p in parts]
-    for side in ("left", "right"):
-        for mark in (side, side[0]):
-            if mark in parts:
-                parts.remove(mark)
-                return side, "".join(parts)
-    word = "".join(parts)
-    for side in ("left", "right"):
-        if word.startswith(side) or word.endswith(side):
-            return side, word.removeprefix(side).removesuffix(side)
-        if word[:1] == side[0] and (word[1:] in ROLES or word[1:] in EITHER or FINGER.fullmatch(word[1:])):
-            return side, word[1:]
-    return "", word
+def side_and_rest(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return for each name of a skeleton the side ("left", "right" or "") and the rest, in small letters."""
+    return [(name.side, name.rest) for name in read_names(names)]
 
 
-def _role(word: str, beside: set[str]) -> str:
-    """Return the role of a plain word, given the plain words of its side; the word itself where it has none."""
-    if found := FINGER.fullmatch(word):
-        finger = "thumb" if word.endswith("finger0") else SAME_FINGER.get(found[1], found[1])
-        return f"{finger} {found[2] if found[2] not in ('', '0') else 1}"
-    word = word.removesuffix("1") if word not in ROLES and word.removesuffix("1") in {*ROLES, *EITHER} else word
-    if word not in EITHER or not beside:
-        return ROLES.get(word, word)
-    alone, rival, then = EITHER[word]
-    others = {ROLES.get(w.removesuffix("1")) for w in beside if w != word}
-    if word == "leg":  # a thigh only where something else is the shin
-        return then if "shin" in others and "thigh" not in others else alone
-    return then if rival in others else alone
+def undriven(body: Limbs, pairs: Container[int]) -> dict[str, int]:
+    """Return what of the body nothing drives, such as "left upper arm", "spine" or "head", and the joint that would move it.
+
+    Hands, collars and toes are no matter: without a partner they go on as the bone above does.
+    """
+    found = {f"{side} {bone}": body.roles.get(f"{side} {role}") for side in ("left", "right") for role, bone in BONES.items()}
+    if not any(j in pairs for j in body.spine):
+        found["spine"] = next(iter(body.spine), None)
+    if not any(j in pairs for j in body.neck):
+        found["head"] = body.roles.get("head")
+    return {limb: j for limb, j in found.items() if j is not None and j not in pairs}
 
 
-def _between(low: int, high: int | None, above: list[list[int]]) -> tuple[int, ...]:
-    """Return the joints above `low` up to and with `high`; none where `high` does not hang on `low`."""
-    if high is None or low not in above[high]:
-        return ()
-    return tuple(reversed(above[high][: above[high].index(low)]))
+def propose(limb: str, name: str, names: Sequence[str], parents: Sequence[int], used: Collection[int]) -> str:
+    """Return the joint of a motion that most likely drives a limb, "" where all are used: of its side, of a name like it.
+
+    Args:
+        limb: of `undriven`. name: of the body's joint. names, parents: of the motion. used: its joints that drive something.
+    """
+    read, tree = read_names(names), _Tree(parents)
+    side = limb.split()[0] if limb.split()[0] in ("left", "right") else ""
+    free = [j for j, n in enumerate(read) if j not in used and n.side in ("", side) and not (n.kind or n.finger)]
+    like = {j: SequenceMatcher(None, name.lower(), names[j].lower()).ratio() for j in free}
+    return names[max(free, key=lambda j: (read[j].side == side, like[j], tree.load[j]))] if free else ""
+
+
+def listed(names: Sequence[str], shown: Mapping[str, str]) -> str:
+    """Return some of a skeleton's joints in a line, as they are shown; fingers, face and helpers are only counted."""
+    small = {n for n, one in zip(names, read_names(names), strict=True) if one.finger or one.kind}
+    large = [text for name, text in shown.items() if name not in small]
+    count = len(shown) - len(large)
+    rest = [f"{count} finger, face or helper joint{'s' if count > 1 else ''}"] if count else []
+    return " and ".join([", ".join(large), *rest] if large else rest)

@@ -49,7 +49,7 @@ def mirror_partners(names: Sequence[str], joints: np.ndarray, parents: Sequence[
 
 def _told(names: Sequence[str]) -> dict[int, int]:
     """Return the partners that names tell: of joints with a side, those of equal rest; of equal names each with its like."""
-    plain = [side_and_rest(name) for name in names]
+    plain = side_and_rest(names)
     seen: Counter = Counter()
     place = {}
     for i, one in enumerate(plain):

@@ -15,6 +15,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_person, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
@@ -164,9 +165,9 @@ def _between_smpl(motion: MotionRecord, body: BodyRecord) -> MotionRecord | None
     poses = np.zeros((len(motion.poses), len(ours), 3), motion.poses.dtype)
     shared = [n for n in ours if n in theirs]
     poses[:, [ours.index(n) for n in shared]] = motion.poses[:, [theirs.index(n) for n in shared]]
-    still = [n for n in ours if n not in theirs]
+    still = {n: n for n in ours if n not in theirs}
     notes = [f"{len(theirs)} joints of the SMPL family drive {len(shared)} of the body's {len(ours)}"]
-    notes += [f"at rest, as nothing drives them: {', '.join(still)}"] if still else []
+    notes += [f"at rest, as nothing drives them: {listed(ours, still)}"] if still else []
     return replace(motion, poses=poses, joint_names=(), notes=tuple(notes))
 
 

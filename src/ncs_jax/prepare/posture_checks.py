@@ -57,7 +57,7 @@ def posture_faults(record: MotionRecord, body: BodyRecord, world: str) -> Iterat
     names = body_names(body)
     if not names:
         return
-    of, few = anatomy(names, body.parents.tolist()), sampled(record)
+    of, few = anatomy(names, body.parents.tolist(), body.joints), sampled(record)
     if "head" not in of.roles or not of.spine:
         return
     told = replace(few, joints=body.joints, parents=body.parents, rest_rotations=body.rest_rotations, joint_names=names)

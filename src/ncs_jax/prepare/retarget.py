@@ -12,7 +12,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.records import SkeletonPoses, shown_frames
-from ncs_jax.prepare.joint_names import Limbs, anatomy, pair
+from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
 from ncs_jax.prepare.skeleton import LIMBS, body_axes, bone, forward, least_turn, rest_of, top, up_axis
 
 __all__ = ["Retargeted", "body_names", "paired", "retarget", "sole_heights", "turn_note", "up_rotation", "with_skeleton"]
@@ -129,15 +129,15 @@ def retarget(
     offsets = forward(bodily, world_turns)[1]  # with the root at its rest place
     translation = home + scale * places[:, hips_s] @ upright.T - offsets[:, hips_t]
     height = "xyz".index(world)
-    soles = sole_heights(body, target, world_turns, offsets + translation[:, None], height, axes[:, 1])
-    low = np.percentile(soles, 5)
+    low = np.percentile(soles := sole_heights(body, target, world_turns, offsets + translation[:, None], height, axes[:, 1]), 5)
     translation[:, height] -= low
     driven = {names[j]: motion.joint_names[i] for j, i in pairs.items()}
-    still = tuple(n for n in names if n not in driven)
-    unused = tuple(n for n in motion.joint_names if n not in set(driven.values()))
-    moved = MotionRecord(local, translation, motion.fps, names, source=_shown(motion, scale * places @ upright.T))
+    used = set(driven.values())
+    still, unused = tuple(n for n in names if n not in driven), tuple(n for n in motion.joint_names if n not in used)
+    lacking, shown = _lacking(motion, names, target, pairs), _shown(motion, scale * places @ upright.T)
+    moved = MotionRecord(local, translation, motion.fps, names, source=shown, undriven=lacking)
     result = Retargeted(moved, driven, still, unused, scale)
-    notes = [*_notes(result, legs, scaled_by, float(soles.max() - low))]
+    notes = [*_notes(result, motion.joint_names, source.shaped, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
         notes.append(f"motion.joints names joints that this motion does not have: {', '.join(absent)}")
     return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright))))
@@ -154,7 +154,8 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
             "a body with joint names expected, as the motion has another skeleton", field="joint_names", value="none",
             mend="write joint_names (J,) into the body's file",
         )  # fmt: skip
-    source, target = anatomy(motion.joint_names, rest_of(motion)[1].tolist()), anatomy(names, body.parents.tolist())
+    rest, parents = rest_of(motion)
+    source, target = anatomy(motion.joint_names, parents.tolist(), rest), anatomy(names, body.parents.tolist(), body.joints)
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
     if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
@@ -163,6 +164,16 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
             mend=f"pair them with the body's by motion.joints in the scene file; the body has {', '.join(names)}",
         )  # fmt: skip
     return source, target, pairs
+
+
+def _lacking(motion: MotionRecord, names: tuple[str, ...], target: Limbs, pairs: dict[int, int]) -> dict[str, str]:
+    """Return what of the body nothing drives, and the line of the scene file that mends it with the likeliest joint."""
+    found, used = {}, set(pairs.values())
+    for limb, j in undriven(target, pairs).items():
+        likely = propose(limb, names[j], motion.joint_names, rest_of(motion)[1].tolist(), used)
+        used |= {motion.joint_names.index(likely)} if likely else set()
+        found[limb] = f'motion.joints = {{ "{likely}" = "{names[j]}" }}' if likely else "a motion that has it"
+    return found
 
 
 def _driven(turns: np.ndarray, body: BodyRecord, pairs: dict[int, int], upright, align) -> tuple[np.ndarray, np.ndarray]:
@@ -286,15 +297,21 @@ def sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.
     return heights.min(axis=1) - (points @ up).min()
 
 
-def _notes(result: Retargeted, leg: float, scaled_by: str, rise: float) -> tuple[str, ...]:
-    """Describe what was done; `leg` is the length of the motion's legs in its own unit, `rise` in m."""
-    count = len(result.pairs) + len(result.still)
-    pairs = [o if o == t else f"{o} by {t}" for o, t in result.pairs.items()]
-    notes = [f"retargeted by joint names, {len(pairs)} of the body's {count} joints are driven: {', '.join(pairs)}"]
+def _notes(
+    result: Retargeted, theirs: tuple[str, ...], shaped: tuple[str, ...], leg: float, scaled_by: str, rise: float
+) -> tuple[str, ...]:
+    """Describe what was done: `theirs` are the motion's joints, `shaped` the roles that only its shape tells, `leg` the
+    length of its legs in its own unit, `rise` in m.
+    """
+    ours = result.motion.joint_names
+    pairs = {o: o if o == t else f"{o} by {t}" for o, t in result.pairs.items()}
+    notes = [f"retargeted by joint names, {len(pairs)} of the body's {len(ours)} joints are driven: {listed(ours, pairs)}"]
+    if shaped:
+        notes.append(f"told by the shape of the motion's skeleton, as its names do not tell them: {', '.join(shaped)}")
     if result.still:
-        notes.append(f"at rest, as nothing drives them: {', '.join(result.still)}")
+        notes.append(f"at rest, as nothing drives them: {listed(ours, {n: n for n in result.still})}")
     if result.unused:
-        notes.append(f"joints of the motion that drive nothing: {', '.join(result.unused)}")
+        notes.append(f"joints of the motion that drive nothing: {listed(theirs, {n: n for n in result.unused})}")
     unit = min(UNITS, key=lambda u: abs(np.log(leg * UNITS[u] / 0.8))) if leg > 0 else "m"
     plausible = LEG[0] < leg * UNITS[unit] < LEG[1]
     guess = f" (it seems to be in {unit})" if plausible and unit != "m" else ""

@@ -151,6 +151,12 @@ def _motion(a: Assembly, name: str) -> Iterator[Risk]:
         yield from _inside(model, record.poses[frames], f"where the body alone carries it in {name}", DEEP, MANY, mend)
 
 
+def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
+    """Yield a risk for each limb, spine or head of the body that no joint of a motion drives."""
+    for limb, mend in record.undriven.items():
+        yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
+
+
 def _postures(a: Assembly) -> Iterator[Risk]:
     """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
     world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
@@ -160,8 +166,9 @@ def _postures(a: Assembly) -> Iterator[Risk]:
 
 
 def find_risks(a: Assembly) -> list[Risk]:
-    """Return all that puts a scene at risk, from its material, its mesh, its fit and its motions; none where it is safe."""
-    found = [*_postures(a), *_material(a.scene), *_mesh(a)]
+    """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
+    found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found += [*_postures(a), *_material(a.scene), *_mesh(a)]
     if a.model.surface is not None:
         joints = 1 if a.body is None else len(a.body.parents)
         found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out: ncs fit")

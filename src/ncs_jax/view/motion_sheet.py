@@ -135,7 +135,7 @@ def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, flo
     x, y, _, _ = projection.project(circle + np.asarray(camera.target) * (1, 0, 1) + (0, floor, 0))
     draw.polygon(list(zip(x.tolist(), y.tolist(), strict=True)), fill=(236, 232, 225))
     x, y, near, _ = projection.project(places)
-    sides = [side_and_rest(name)[0] if name else "" for name in source.joint_names]
+    sides = [side for side, _ in side_and_rest(source.joint_names)]
     for j in np.argsort(near).tolist():
         parent = int(source.parents[j])
         if parent >= 0 and np.isfinite([x[j], y[j], x[parent], y[parent]]).all():
