@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.fbx import Fbx, Packed, Record, read_fbx
-from ncs_jax.io.character.fbx_character import _graph, _worlds
+from ncs_jax.io.character.fbx_character import _worlds
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
+from ncs_jax.io.character.fbx_graph import graph_of
 from tests import fbx_files as fbx
 from tests.characters import JOINTS, NAMES, figure, posed, rigid
+from tests.scenes import grid
 
 ASSETS = Path(io.__file__).parents[1] / "assets"
 BLENDER = os.environ.get("NCS_BLENDER")
@@ -186,7 +188,7 @@ def test_pivots_orders_and_inherited_scales(tmp_path):
         UnitScaleFactor=100.0,
     )  # fmt: skip
     (tmp_path / "models.fbx").write_bytes(fbx.binary(tree))
-    found = _worlds(_graph(read_fbx(tmp_path / "models.fbx")))
+    found = _worlds(graph_of(read_fbx(tmp_path / "models.fbx")))
     expected = []
     for j, one in enumerate(given):
         turn = euler(one["PreRotation"]) * euler(one["Lcl__Rotation"], orders[j]) * euler(one["PostRotation"]).inv()
@@ -363,3 +365,53 @@ def test_what_blender_writes_moves_as_in_blender(tmp_path):
         assert np.abs(posed(body, motion)[:, order] - expected).max() < 1e-5
     alone = io.read_motion(tmp_path / "idle.fbx")
     assert set(alone.joint_names) >= set(record.joint_names)
+
+
+# --- meshes by name, blend shapes, garments -----------------------------------------------------------------------------------
+
+
+def wardrobe(path: Path, writer, *, percent: float = 0.0) -> Path:
+    """The character, with a blend shape on its skin, beside a skirt of quads that has no skin, in centimetres, mirrored."""
+    tree = Hero("Y up, cm").tree()
+    objects, links = tree[2][2], tree[3][2]
+    x, _ = grid(4, 3)
+    corner = (np.arange(3)[:, None] * 3 + np.arange(2)).reshape(-1)
+    quads = np.stack([corner, corner + 1, corner + 4, -1 - (corner + 3)], axis=1).astype(np.int32)
+    edge = np.array([0, -2], np.int32)  # one that stands by itself
+    place = fbx.properties(Lcl__Translation=(10, 0, 0), Lcl__Scaling=(-100, 100, 100))
+    objects += [
+        ("Model", [70, "Model::Skirt", "Mesh"], [place]),
+        ("Geometry", [71, "Geometry::Skirt_mesh", "Mesh"], [
+            ("Vertices", [x.ravel()], None), ("PolygonVertexIndex", [np.concatenate([quads.ravel(), edge])], None),
+        ]),
+        ("Deformer", [80, "Deformer::", "BlendShape"], []),
+        ("Deformer", [81, "SubDeformer::tall", "BlendShapeChannel"], [fbx.properties(DeformPercent=percent)]),
+        ("Geometry", [82, "Geometry::tall", "Shape"], [
+            ("Indexes", [np.array([0, 3, 4], np.int32)], None), ("Vertices", [np.tile([0.0, 1.0, 0.0], 3)], None),
+        ]),
+    ]  # fmt: skip
+    links += [fbx.link(70, 0), fbx.link(71, 70), fbx.link(80, 31), fbx.link(81, 80), fbx.link(82, 81)]
+    path.write_bytes(WRITERS[writer](tree))
+    return path
+
+
+@pytest.mark.parametrize("writer", ["text", "binary"])
+def test_meshes_blend_shapes_and_garments(tmp_path, writer):
+    path = wardrobe(tmp_path / "hero.fbx", writer)
+    with pytest.raises(InputError, match=r"garment\.mesh: one object.*Skin \(\d+ vertices\), Skirt \(12 vertices\)"):
+        io.read_garment(path)
+    for name in ("Skirt", "Skirt_mesh"):
+        skirt = io.read_garment(path, mesh=[name])
+        np.testing.assert_allclose(skirt.vertices, grid(4, 3)[0] * [-1, 1, 1] + [0.1, 0, 0], atol=1e-9)
+        a, b, c = (skirt.vertices[skirt.faces[:, k]] for k in range(3))
+        assert len(skirt.faces) == 12 and (np.cross(b - a, c - a)[:, 2] > 0).all()
+    body, tall = io.read_body(path), io.read_body(path, part=["Skin"], shapes={"tall": 0.5})
+    moved = tall.vertices - body.vertices
+    assert (np.abs(moved).max(axis=1) > 1e-4).sum() == 3
+    half = io.read_body(wardrobe(tmp_path / "half.fbx", writer, percent=50.0))
+    np.testing.assert_allclose(half.vertices, tall.vertices, atol=1e-9)
+    np.testing.assert_allclose(io.read_garment(path, mesh=["Skin"]).vertices, body.vertices, atol=1e-6)
+    with pytest.raises(InputError, match=r"body\.shapes: no such shape.*'wide'.*tall"):
+        io.read_body(path, shapes={"wide": 1.0})
+    with pytest.raises(InputError, match=r"body\.part: no such mesh.*'Skirt'.*Skin \("):  # it has no skin
+        io.read_body(path, part=["Skirt"])

@@ -7,8 +7,8 @@ import trimesh
 from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
 from ncs_jax.geometry.mesh import topology
+from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare.fit import BAND, fit, place
-from ncs_jax.scene.spec import ASSETS
 
 from .scenes import post, write_scene
 from .shapes import tube

@@ -199,7 +199,10 @@ def test_usd_meshes_that_face_the_other_way(tmp_path):
     add(stage, "/guide", x, polygons).CreatePurposeAttr("guide")
     add(stage, "/off", x, polygons).GetPrim().SetActive(False)
     stage.GetRootLayer().Save()
-    record = io.read_garment(tmp_path / "g.usda")
+    with pytest.raises(InputError, match=r"garment\.mesh: one object.*/a \(8 vertices\)"):
+        io.read_garment(tmp_path / "g.usda")
+    assert len(io.read_garment(tmp_path / "g.usda", mesh=["b"]).vertices) == 8
+    record = io.read_garment(tmp_path / "g.usda", mesh=["a", "b", "/c"])
     assert record.vertices.shape == (24, 3) and record.faces.shape == (12, 3)
     sizes = doubled(record.vertices, record.faces, [0, 0, 1.0])
     np.testing.assert_allclose(sizes, 1)  # what is outside stays outside, also in a mirror

@@ -200,7 +200,7 @@ def at(*keys, value):
 
 POSITION = ("meshes", 0, "primitives", 0, "attributes")
 BROKEN = {
-    "draco": (at("extensionsRequired", value=["KHR_draco_mesh_compression"]), "found 'KHR_draco_mesh_compression'"),
+    "draco": (at(*POSITION[:-1], "extensions", value={"KHR_draco_mesh_compression": {"bufferView": 99}}), "draco"),
     "meshopt": (at("extensionsRequired", value=["EXT_meshopt_compression"]), "found 'EXT_meshopt_compression'"),
     "meshopt view": (at("bufferViews", 0, "extensions", value={"EXT_meshopt_compression": {}}), "plain buffers expected"),
     "version": (at("asset", "version", value="1.0"), "glTF 2 expected"),
@@ -226,7 +226,7 @@ BROKEN = {
     "joints as floats": (at(*POSITION, "JOINTS_0", value=2), "whole numbers and weights"),
     "few joints": (at("skins", 0, "joints", value=[1, 2]), "joints from 0 to 1 expected"),
     "a joint twice": (at("skins", 0, "joints", value=[1, 2, 2]), "different numbers"),
-    "no binds": (at("skins", 0, "inverseBindMatrices", value=None), "inverseBindMatrices expected"),
+    "few binds": (at("skins", 0, "inverseBindMatrices", value=0), "VEC3|MAT4 expected"),
     "no skin": (at("nodes", 4, "skin", value=None), "a skinned mesh expected"),
     "circle": (at("nodes", 3, "children", value=[1]), "one parent for each node|a circle"),
     "itself": (at("nodes", 0, "children", value=[0, 1, 4]), "a circle"),

@@ -555,7 +555,7 @@ DAMAGED = {
     "not_hdf5.h5": (b"poses", "not a readable HDF5"),
     "truncated.h5": (b"\x89HDF\r\n\x1a\n" + b"\0" * 100, "not a readable HDF5"),
     "empty.h5": (b"", "an empty file"),
-    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh, .glb, .gltf, .fbx expected"),
+    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh, .glb, .gltf, .vrm, .fbx expected"),
     "m": (b"1", "found 'no suffix'"),
     "words.bvh": (b"hello", "HIERARCHY and then MOTION"),
     "binary.bvh": (bytes(range(256)) * 4, "HIERARCHY and then MOTION"),
@@ -630,10 +630,10 @@ GARMENTS = {
     "line.obj": (OBJ.replace("f -2/-2 -3/-3/1 -1/5", "f 1 2").encode(), "line 19: three corners"),
     "nan.obj": (OBJ.replace("v 1 1 0", "v 1 nan 0").encode(), "vertices, vertex 2: finite"),
     "words.ply": (b"hello", "a header from ply to end_header"),
-    "words.glb": (b"hello", "not a readable .glb"),
+    "words.glb": (b"hello", "that begins with .glTF. expected"),
     "empty.stl": (b"", "an empty file"),
     "words.stl": (b"hello", "vertices: a mesh with vertices and triangles"),
-    "g.dae": (b"hello", "one of .npz, .obj, .ply, .stl, .glb, .usd, .usdc, .usda, .usdz expected"),
+    "g.dae": (b"hello", "one of .npz, .ply, .stl, .obj, .glb, .gltf, .vrm, .fbx, .usd, .usdc, .usda, .usdz expected"),
     "count.ply": (
         b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
         b"property float x\nproperty float y\nproperty float z\n"

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.io import read_body
 from ncs_jax.io.character.hierarchy import path_to_root
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
 from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.prepare.retarget import retarget
-from ncs_jax.scene.spec import packaged
 from tests.skeletons import ROLES, SKELETONS, skeleton
 from tests.test_retarget import CONVENTIONS, body_of, figure, motion_of
 

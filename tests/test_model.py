@@ -14,7 +14,7 @@ from ncs_jax.geometry.mesh import topology
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
 from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import touchable
+from ncs_jax.prepare.touchable import Skinned, touchable
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene
@@ -166,14 +166,14 @@ def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
         by_pose.append(distance <= reach)
         right |= distance <= reach
     blends = blend_from(cloth_weights, dtype=jnp.float64), blend_from(body["blend_weights"], dtype=jnp.float64)
-    found = touchable(skeleton, cloth, blends[0], body["vertices"], blends[1], bent, reach)
+    found = touchable(skeleton, Skinned(cloth, blends[0]), Skinned(body["vertices"], blends[1]), bent, reach)
     np.testing.assert_array_equal(found, right)
     assert not found.all()
     if reach > 0.03:
         assert by_pose[0].any()
     if reach > 0.05:
         assert (by_pose[1] & ~by_pose[0] & ~by_pose[2]).any()  # the folded arm is what the poses are looked at for
-    at_rest = touchable(skeleton, cloth, blends[0], body["vertices"], blends[1], [], reach)
+    at_rest = touchable(skeleton, Skinned(cloth, blends[0]), Skinned(body["vertices"], blends[1]), [], reach)
     np.testing.assert_array_equal(at_rest, by_pose[0])
 
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
-from ncs_jax.scene.spec import packaged, scene_from
+from ncs_jax.scene.spec import scene_from
 
 HIERARCHY = """\
 HIERARCHY

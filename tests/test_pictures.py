@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.energies.terms import MEASURED, NAMES
 from ncs_jax.errors import InputError
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
-from ncs_jax.scene.spec import packaged, scene_from
+from ncs_jax.scene.spec import scene_from
 from ncs_jax.view import curves, pictures
 from ncs_jax.view.animation import Animation, PosedBody, upright
 from ncs_jax.view.camera import Camera

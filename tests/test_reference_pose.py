@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.prepare.posture_checks import posture_faults
-from ncs_jax.scene.spec import MotionSpec, packaged
+from ncs_jax.scene.spec import MotionSpec
 from tests.test_retarget import figure, forward
 
 FRAMES = 48

@@ -15,10 +15,11 @@ from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import to_rest_axes
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import anatomy, pair
 from ncs_jax.prepare.motion_import import lead_in_frames, load_motion, retarget_to_body
 from ncs_jax.prepare.retarget import body_names, retarget, with_skeleton
-from ncs_jax.scene.spec import MotionSpec, load_scene, packaged, scene_from
+from ncs_jax.scene.spec import MotionSpec, load_scene, scene_from
 from ncs_jax.view.character import body_vertices
 
 CLIPS = ("10_01", "02_02", "03_03")

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion, retarget_to_body
 from ncs_jax.prepare.retarget import with_skeleton
-from ncs_jax.scene.spec import MotionSpec, packaged, scene_from
+from ncs_jax.scene.spec import MotionSpec, scene_from
 from tests.test_retarget import body_of, directions, forward
 
 UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from Z up to Y up
@@ -37,7 +38,8 @@ def model(rng, joints=24, vertices=40) -> dict:
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "J_regressor": regressor / regressor.sum(axis=1, keepdims=True),
         "kintree_table": np.stack([root, np.arange(joints, dtype=np.uint32)]),
-        "posedirs": np.array([{}], object),
+        "posedirs": rng.normal(scale=0.01, size=(vertices, 3, 9 * (joints - 1))),
+        "joint2num": np.array([{}], object),
         "J": rng.normal(size=(joints, 3)),
     }
 

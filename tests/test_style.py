@@ -32,6 +32,7 @@ HEAVY = {
     "onnxruntime",
     "flatbuffers",
     "viser",
+    "DracoPy",
 }
 NUMERIC = {"geometry", "energies", "scene", "network", "simulation", "metrics", "training"}  # compute, and read nothing
 DRAWS = {"view"}

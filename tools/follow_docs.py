@@ -72,7 +72,7 @@ def follow(chosen: Sequence[Path], *, experiments: bool = False) -> list[str]:
 def furnish() -> None:
     """Make the files that the pages name: runs, a garment, a character that moves, a capture, a simulation."""
     from ncs_jax import io, train
-    from ncs_jax.scene.spec import packaged
+    from ncs_jax.io.packaged import packaged
 
     run = train("ncs:tshirt", RUNS[0], steps=int(STEPS))
     for name in RUNS[1:]:

@@ -66,6 +66,8 @@ def animate(options) -> int:
     fps = run.assembly.model.fps
     io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, worn_by=worn_by)
     print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
+    if worn_by is not None and worn_by[0].posedirs is not None:
+        print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0
 
 

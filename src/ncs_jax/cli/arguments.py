@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import re
 from collections.abc import Callable
 
-__all__ = ["FORMATS", "command", "finite", "hosts", "positive", "seed", "whole"]
+__all__ = ["FORMATS", "add_body", "body_of", "body_table", "command", "finite", "hosts", "positive", "seed", "whole"]
 
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
@@ -17,6 +18,29 @@ def command(commands, name: str, run: Callable, text: str) -> argparse.ArgumentP
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(run=run)
     return parser
+
+
+def add_body(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which body is meant."""
+    parser.add_argument("--body", default="ncs:body", metavar="FILE", help="body file (default: ncs:body, the packaged one)")
+    parser.add_argument("--part", nargs="+", default=[], metavar="NAME", help="meshes of the file that are the body")
+    parser.add_argument(
+        "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
+    )
+
+
+def body_of(options):
+    """Return the body that the options of `add_body` mean."""
+    from ncs_jax import io
+
+    return io.read_body(options.body, betas=options.betas, part=options.part)
+
+
+def body_table(options) -> str:
+    """Return the lines of a scene file that mean the body of these options."""
+    lines = [f"[body]\nfile = {json.dumps(options.body)}"]
+    lines += [f"{name} = {json.dumps(value)}" for name in ("part", "betas") if (value := getattr(options, name))]
+    return "\n".join(lines)
 
 
 def positive(text: str) -> float:

@@ -89,6 +89,10 @@ def _tell_scene(assembly: Assembly) -> None:
     _tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if assembly.body is not None and model.body is not None:
         _tell("body", f"{len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+    if assembly.prepared.betas.size:
+        _tell("shape", f"betas {', '.join(f'{b:.3g}' for b in assembly.prepared.betas)}")
+    for note in (*(() if assembly.body is None else assembly.body.notes), *record.notes):
+        _tell("note", note)
     for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
         _tell("over", f"{name}: {len(layer.rest)} vertices")
     _tell("joints", listed(joints, {name: name for name in joints}))

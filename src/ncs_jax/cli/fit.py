@@ -20,8 +20,9 @@ def add_commands(commands) -> None:
     parser = arguments.command(
         commands, "fit", fit, "bring a garment onto a body, and write it as a file to train with, and a picture"
     )
-    parser.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .usd*")
-    parser.add_argument("--body", default="ncs:body", metavar="FILE", help="body file (default: ncs:body, the packaged one)")
+    parser.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .vrm, .fbx, .usd*")
+    arguments.add_body(parser)
+    parser.add_argument("--mesh", nargs="+", default=[], metavar="NAME", help="meshes of the file that are the garment")
     parser.add_argument("--out", required=True, metavar="FILE", help=".npz; the picture goes beside it, as .png")
     parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found)")
     parser.add_argument("--up", choices=("x", "y", "z"), default="", help="the axis that is up in the file (default: found)")
@@ -41,6 +42,7 @@ def fit(options) -> int:
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.fit import fit as fitted
     from ncs_jax.prepare.garment_checks import summarise_surface
+    from ncs_jax.prepare.skinning_weights import with_body_weights
     from ncs_jax.view.animation import Animation, PosedBody
     from ncs_jax.view.pictures import contact_sheet
 
@@ -49,8 +51,8 @@ def fit(options) -> int:
         raise InputError(
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
         )
-    body = io.read_body(scene.path(options.body))
-    given = io.read_garment(scene.path(options.garment), scale=options.scale, up=options.up, weld=options.weld)
+    body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up, "weld": options.weld}
+    given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), body)
     asked = {name: value for name, value in (("scale", options.scale), ("up", options.up)) if value}
     found = fitted(options.garment, given, body, clearance=options.clearance, **asked)
     g, (before, after) = found.garment, found.depth
@@ -82,6 +84,6 @@ def fit(options) -> int:
     labels = ("placed", "out of the body")
     animation = Animation(np.stack([found.before, x]), g.faces, 1.0, PosedBody(sides, body.faces))
     contact_sheet(picture, animation, frames=2, labels=labels)
-    print(f"wrote {out} and {picture}. In the scene file:\n\n[body]\nfile = {json.dumps(options.body)}\n")
+    print(f"wrote {out} and {picture}. In the scene file:\n\n{arguments.body_table(options)}\n")
     print(f"[garment]\nfile = {json.dumps(out.name)}" + (f'\npins = "{PINS}"' if PINS in g.groups else ""))
     return 0

@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, animate, export, simulate, evaluate, view, fit, check."""
+"""The command line: ncs demo, train, animate, export, simulate, evaluate, view, body, fit, check."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-from ncs_jax.cli import animate, check, evaluate, fit, simulate, train, view
+from ncs_jax.cli import animate, body, check, evaluate, fit, simulate, train, view
 from ncs_jax.errors import InputError
 
 __all__ = ["main"]
@@ -23,6 +23,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs view RUN|FILE|SCENE           look at it in a browser: play, scrub, orbit, alpha, colours
+  ncs body --out FILE               write a body at rest, to model clothes on it
   ncs fit GARMENT --out FILE        bring a garment onto a body: units, axes, place, out of the skin, pins, weights
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
 """
@@ -61,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="ncs", description=DESCRIPTION, formatter_class=raw)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (train, animate, simulate, evaluate, fit, view, check):
+    for group in (train, animate, simulate, evaluate, body, fit, view, check):
         group.add_commands(commands)
     return parser
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -11,10 +12,13 @@ from jaxtyping import Array, Float
 
 __all__ = [
     "Blend",
+    "Correctives",
     "Pose",
     "Skeleton",
     "blend",
     "blend_from",
+    "corrected",
+    "correctives_from",
     "forward",
     "skin",
     "to_rest_axes",
@@ -51,6 +55,15 @@ class Blend:
     """
 
     weights: Float[Array, "verts used"]
+    joints: tuple[int, ...] = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Correctives:
+    """Pose correctives of SMPL: how a vertex moves before skinning, m, by each entry of R_j - I of some joints, row by row."""
+
+    directions: Float[Array, "verts 3 entries"]
     joints: tuple[int, ...] = field(metadata={"static": True})
 
 
@@ -121,6 +134,42 @@ def blend(matrices: Float[Array, "joints 3 4 *poses"], weights: Blend) -> Float[
 def skin(transforms: Float[Array, "verts 3 4 *poses"], x: Float[Array, "verts 3 *#poses"]) -> Float[Array, "verts 3 *poses"]:
     """Pose positions by linear blend skinning, from unposed ones, m."""
     return sum((transforms[:, :, i] * x[:, i, None] for i in range(3)), start=transforms[:, :, 3])
+
+
+def correctives_from(posedirs: np.ndarray, number: Mapping[int, int] | None = None, dtype=jnp.float32) -> Correctives:
+    """Return pose correctives without the joints that move no vertex by more than a nanometre.
+
+    Args:
+        posedirs: (verts, 3, 9 (joints - 1)) m, as in a body, of some of its vertices. number: of the body's joints in the
+            skeleton; None: it has them all.
+    """
+    verts = len(posedirs)
+    by_joint = np.asarray(posedirs).reshape(verts, 3, -1, 9)
+    moving = np.flatnonzero(np.abs(by_joint).max(axis=(0, 1, 3), initial=0) > 1e-9)
+    joints = tuple(int(j) + 1 if number is None else number[int(j) + 1] for j in moving)
+    return Correctives(jax.device_put(by_joint[:, :, moving].reshape(verts, 3, -1).astype(dtype)), joints)
+
+
+def corrected(
+    x: Float[Array, "verts 3 *#poses"],
+    correctives: Correctives | None,
+    matrices: Float[Array, "joints 3 4 *poses"],
+    parents: Sequence[int],
+) -> Float[Array, "verts 3 *poses"]:
+    """Return unposed positions as a pose corrects them, m: x + P vec(R_j - I) (Loper et al. 2015, (9)); x where P is None.
+
+    R_j = R_parent^T R_world are the local rotations in the joints' transforms, in any number of poses.
+    """
+    if correctives is None or not correctives.joints:
+        return x
+    joints = np.asarray(correctives.joints)
+    own, above = matrices[joints, :, :3], matrices[np.asarray(parents)[joints], :, :3]
+    local = [above[:, c, :, None] * own[:, c, None, :] for c in range(3)]
+    eye = jnp.eye(3, dtype=x.dtype).reshape(1, 3, 3, *(1,) * (matrices.ndim - 3))
+    entries = (local[0] + local[1] + local[2] - eye).reshape(9 * len(joints), -1)
+    directions = correctives.directions
+    moved = jnp.matmul(directions.reshape(-1, directions.shape[2]), entries, precision="highest")
+    return x + moved.reshape(*directions.shape[:2], *matrices.shape[3:])
 
 
 def unpose(transforms: Float[Array, "verts 3 4"], x: Float[Array, "verts 3"]) -> Float[Array, "verts 3"]:

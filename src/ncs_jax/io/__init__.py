@@ -3,6 +3,8 @@
 from ncs_jax.io.animation.animation import read_animation, write_animation
 from ncs_jax.io.character.body import read_body
 from ncs_jax.io.character.motion import read_motion
+from ncs_jax.io.character.smpl_model import read_betas
+from ncs_jax.io.character.write_body import write_body
 from ncs_jax.io.mesh.garment import read_garment, write_garment
 from ncs_jax.io.records import AnimationRecord, BodyRecord, GarmentRecord, MotionRecord
 
@@ -12,9 +14,11 @@ __all__ = [
     "GarmentRecord",
     "MotionRecord",
     "read_animation",
+    "read_betas",
     "read_body",
     "read_garment",
     "read_motion",
     "write_animation",
+    "write_body",
     "write_garment",
 ]

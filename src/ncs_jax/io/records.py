@@ -24,7 +24,9 @@ class BodyRecord:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. joints: (J, 3) global rest positions, m.
         parents: (J,) int32 with parents[j] < j, and -1 for joint 0, the root. weights: (V, J) skinning weights, not negative;
             every row sums to 1. joint_names: J names, or none. rest_rotations: (J, 3, 3) rotations of the joints in the rest
-            pose, or None for the identity.
+            pose, or None for the identity. posedirs: (V, 3, 9 (J - 1)) pose correctives of SMPL, m: what the entries of
+            R_j - I of every joint but the root add to the vertices, before skinning; None: no correctives. notes: what was
+            mended in the file.
     """
 
     vertices: np.ndarray
@@ -34,6 +36,8 @@ class BodyRecord:
     weights: np.ndarray
     joint_names: tuple[str, ...] = ()
     rest_rotations: np.ndarray | None = None
+    posedirs: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,8 @@ class GarmentRecord:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
             or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: the file's unit in metres and its
             axis that is up; both are already applied. welded: how many of the file's vertices were merged into another.
-            weights: (V, J) skinning weights for the body's joints, not negative, every row sums to 1; None: the body's.
+            weights: (V, J) skinning weights, not negative, every row sums to 1; None: the body's. joint_names: the J joints of
+            the weights, none where they are the body's, in its order. notes: what was mended in the file.
     """
 
     vertices: np.ndarray
@@ -55,6 +60,8 @@ class GarmentRecord:
     up: str = "y"
     welded: int = 0
     weights: np.ndarray | None = None
+    joint_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

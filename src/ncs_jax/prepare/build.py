@@ -23,6 +23,7 @@ from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
 from ncs_jax.prepare.retarget import body_names
+from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
@@ -77,7 +78,8 @@ def build(
     """
     say = report or (lambda words: None)
     say(f"reading {scene.garment.file} and {scene.body.file}")
-    files = _read(scene, below, dtype)
+    betas = _betas(scene) if prepared is None else prepared.betas
+    files = _read(scene, betas, below, dtype)
     motions: dict[str, io.MotionRecord] = {}
     training: list[io.MotionRecord] | None = None
     if prepared is None:
@@ -86,7 +88,7 @@ def build(
             motions[name] = load_motion(scene, name, files.body)
         say("preparing the garment")
         training = [motions[name] for name in scene.motion.files]
-        prepared = prepare_scene(files, training)
+        prepared = replace(prepare_scene(files, training), betas=betas)
     model = model_from(files, prepared, dtype)
     track = None if training is None else _training_features(files, model, training)
     faces = None
@@ -105,11 +107,41 @@ def build(
 # --- read and check ---------------------------------------------------------------------------------------------------------
 
 
-def _read(scene: Scene, below: Sequence[tuple[Assembly, dict]], dtype) -> SceneFiles:
+def _betas(scene: Scene) -> np.ndarray:
+    """Return the shape of the scene's body: its own betas, or those on which all its motions agree."""
+    if not isinstance(scene.body.betas, str):
+        return np.array(scene.body.betas, np.float64)
+    found = {name: io.read_betas(scene.path(name)) for name in scene.motions}
+    if not found:
+        raise InputError(
+            "a motion with betas expected", file=scene.source, field="body.betas", value=scene.body.betas, mend="write numbers"
+        )
+    first = next(iter(found))
+    for name, betas in found.items():
+        both = np.zeros((2, max(len(betas), len(found[first]))))
+        both[0, : len(betas)], both[1, : len(found[first])] = betas, found[first]
+        if np.abs(both[0] - both[1]).max(initial=0) > 1e-4:
+            raise InputError(
+                "motions of one person expected: their betas differ", file=scene.source, field="body.betas",
+                value=f"{first} and {name}", mend="write the betas as numbers, or take motions of one person",
+            )  # fmt: skip
+    return np.trim_zeros(found[first], "b")
+
+
+def _read(scene: Scene, betas: np.ndarray, below: Sequence[tuple[Assembly, dict]], dtype) -> SceneFiles:
     """Read the files of a scene but for its motions, and check that they fit together."""
-    body = None if scene.body.file in ("", "none") else io.read_body(scene.path(scene.body.file))
-    spec = scene.garment
-    garment = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld)
+    body, person, spec = None, scene.body, scene.garment
+    if person.file not in ("", "none"):
+        body = io.read_body(
+            scene.path(person.file),
+            betas=betas.tolist(),
+            shapes=person.shapes,
+            part=person.meshes,
+            correctives=person.correctives,
+        )
+    garment = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    if body is not None:
+        garment = with_body_weights(garment, body)
     if body is not None:
         _check_body(scene.path(scene.body.file), body)
         _check_garment(scene, garment, body)
@@ -168,7 +200,7 @@ def _layers(scene: Scene, body: io.BodyRecord | None, below: Sequence[tuple[Asse
                 f"a garment trained at {scene.motion.fps:g} frames per second expected", file=scene.source, field=field,
                 value=model.fps, mend="give both scenes the same motion.fps",
             )  # fmt: skip
-        alone = replace(model, body=None, body_blend=None, surface=None, under=())
+        alone = replace(model, body=None, body_blend=None, correctives=None, surface=None, under=())
         layer = Layer(alone, params, assembly.network)
         found.append(jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, layer))
     return tuple(found)

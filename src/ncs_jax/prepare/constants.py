@@ -7,7 +7,7 @@ import numpy as np
 
 from ncs_jax.energies.contact.pairs import groups_from
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, Terms
-from ncs_jax.geometry.skinning import Skeleton, blend_from
+from ncs_jax.geometry.skinning import Skeleton, blend_from, correctives_from
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.prepare.prepared import Prepared, SceneFiles
 from ncs_jax.prepare.skinning_weights import used_joints
@@ -20,17 +20,19 @@ __all__ = ["model_from"]
 def model_from(files: SceneFiles, prepared: Prepared, dtype) -> Model:
     """Return the constants of a scene, without the body's surface and without vibrations, which need the motions.
 
-    The skeleton keeps the joints that move the garment or the touchable body, those that the network reads, and all above.
+    The skeleton keeps the joints that move the garment or the touchable body, those that the network
+    reads or that correct the body, and all above.
     """
     scene, body, physics = files.scene, files.body, files.scene.physics
     parents, joints, rest_rotations, body_weights = np.array([-1]), np.zeros((1, 3)), None, np.zeros((0, 1))
     if body is not None:
         parents, joints, rest_rotations = np.asarray(body.parents), body.joints, body.rest_rotations
         body_weights = body.weights[prepared.part]
-    kept = _kept_joints(prepared, parents, body_weights)
+    collides = len(prepared.part) > 0 and physics.collision.stiffness > 0
+    posedirs = body.posedirs[prepared.part] if collides and body is not None and body.posedirs is not None else None
+    kept = _kept_joints(prepared, parents, body_weights, () if posedirs is None else correctives_from(posedirs).joints)
     number = {j: i for i, j in enumerate(kept)}  # of the body's joint in the model's skeleton
     kept_parents = tuple(number[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
-    collides = len(prepared.part) > 0 and physics.collision.stiffness > 0
     body_points = body_blend = None
     if collides and body is not None:
         body_points = jnp.asarray(body.vertices[prepared.part], dtype)
@@ -53,13 +55,14 @@ def model_from(files: SceneFiles, prepared: Prepared, dtype) -> Model:
         fps=scene.motion.fps,
         moves=bool(prepared.moves),
         under=files.layers if collides else (),
+        correctives=None if posedirs is None else correctives_from(posedirs, number, dtype),
     )
 
 
-def _kept_joints(prepared: Prepared, parents: np.ndarray, body_weights: np.ndarray) -> list[int]:
+def _kept_joints(prepared: Prepared, parents: np.ndarray, body_weights: np.ndarray, correcting: tuple[int, ...]) -> list[int]:
     """Return the body's joints that the model's skeleton keeps, parents before children."""
     skinning = used_joints(parents.tolist(), np.concatenate([prepared.weights, body_weights]), least=1e-4)
-    return sorted(set(skinning).union(*(path_to_root(parents, j) for j in prepared.inputs.tolist())))
+    return sorted(set(skinning).union(*(path_to_root(parents, j) for j in (*prepared.inputs.tolist(), *correcting))))
 
 
 def _membrane(physics: PhysicsSpec) -> tuple[str | None, tuple[float, ...]]:

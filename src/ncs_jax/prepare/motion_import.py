@@ -15,11 +15,12 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_person, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
-from ncs_jax.scene.spec import MotionSpec, Scene, packaged
+from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
 

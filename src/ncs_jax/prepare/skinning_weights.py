@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.geometry.closest_point import closest_weights
 from ncs_jax.geometry.mesh import adjacency
 from ncs_jax.io.character.hierarchy import path_to_root
+from ncs_jax.io.records import BodyRecord, GarmentRecord
 
-__all__ = ["smooth_weights", "transfer_weights", "used_joints"]
+__all__ = ["smooth_weights", "transfer_weights", "used_joints", "with_body_weights"]
 
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -47,3 +49,21 @@ def used_joints(parents: Sequence[int], weights: np.ndarray, least: float = 0.01
     """Return the joints whose weight (verts, joints) reaches `least` on some vertex, and all joints above them, in order."""
     wanted = np.flatnonzero(np.asarray(weights).max(axis=0, initial=0) >= least).tolist()
     return tuple(sorted({list(parents).index(-1)}.union(*(path_to_root(parents, j) for j in wanted))))
+
+
+def with_body_weights(garment: GarmentRecord, body: BodyRecord) -> GarmentRecord:
+    """Return a garment whose own skinning weights, if any, are for the body's joints, found by name.
+
+    A garment that was skinned to joints that the body does not have loses its weights; a note says so.
+    """
+    if garment.weights is None or not garment.joint_names:
+        return garment
+    used = np.flatnonzero(garment.weights.max(axis=0) > 0)
+    place = {name: j for j, name in enumerate(body.joint_names)}
+    missing = [garment.joint_names[j] for j in used if garment.joint_names[j] not in place]
+    if missing:
+        note = f"the garment's own skinning weights are not used: the body has no joint {missing[0]}"
+        return replace(garment, weights=None, joint_names=(), notes=(*garment.notes, note))
+    weights = np.zeros((len(garment.vertices), len(body.parents)), garment.weights.dtype)
+    weights[:, [place[garment.joint_names[j]] for j in used]] = garment.weights[:, used]
+    return replace(garment, weights=weights, joint_names=())

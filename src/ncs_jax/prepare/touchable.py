@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,34 +12,45 @@ import numpy as np
 from ncs_jax import io
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
-from ncs_jax.geometry.skinning import Blend, Skeleton, blend, blend_from, forward, skin, transforms
+from ncs_jax.geometry.skinning import (
+    Blend,
+    Correctives,
+    Skeleton,
+    blend,
+    blend_from,
+    corrected,
+    correctives_from,
+    forward,
+    skin,
+    transforms,
+)
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
 
-__all__ = ["covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = ["Skinned", "covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
 
-def touchable(
-    skeleton: Skeleton,
-    garment: np.ndarray,
-    garment_blend: Blend,
-    body: np.ndarray,
-    body_blend: Blend,
-    rotations: Sequence[np.ndarray],
-    reach: float,
-) -> np.ndarray:
+class Skinned(NamedTuple):
+    """Vertices at rest (verts, 3), m, with what poses them."""
+
+    rest: np.ndarray
+    blend: Blend
+    correctives: Correctives | None = None
+
+
+def touchable(skeleton: Skeleton, garment: Skinned, body: Skinned, rotations: Sequence[np.ndarray], reach: float) -> np.ndarray:
     """Return which body vertices (body,) come within `reach` (m) of the skinned rest garment in any of the given poses.
 
     `rotations` holds the local rotations (joints, 3, 3) of every pose. The rest pose is always checked too.
     """
     from scipy.spatial import cKDTree
 
-    near = np.zeros(len(body), bool)
+    near = np.zeros(len(body.rest), bool)
     rest = np.broadcast_to(np.eye(3), (len(skeleton.parents), 3, 3))
     dtype = skeleton.joints.dtype
-    worn = [(jnp.asarray(garment, dtype), garment_blend), (jnp.asarray(body, dtype), body_blend)]
+    worn = [(jnp.asarray(w.rest, dtype), w.blend, w.correctives) for w in (garment, body)]
     for local in [rest, *rotations]:
         cloth, skin_ = map(np.asarray, _posed(skeleton, worn, jnp.asarray(local, dtype)))
         distance, _ = cKDTree(cloth).query(skin_, distance_upper_bound=reach)
@@ -48,9 +60,9 @@ def touchable(
 
 @jax.jit
 def _posed(skeleton: Skeleton, worn, local) -> list[jax.Array]:
-    """Return vertices (m) posed by local rotations, of every pair of those at rest and their skinning weights."""
+    """Return vertices (m) posed by local rotations, of all at rest with their skinning weights and pose correctives."""
     m = transforms(skeleton, forward(skeleton, local, jnp.zeros(3, local.dtype)))
-    return [skin(blend(m, weights), rest) for rest, weights in worn]
+    return [skin(blend(m, weights), corrected(rest, more, m, skeleton.parents)) for rest, weights, more in worn]
 
 
 COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
@@ -119,12 +131,11 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
     corners = body.vertices[body.faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
+    more = None if body.posedirs is None else correctives_from(body.posedirs)
     near = touchable(
         skeleton,
-        garment.vertices,
-        blend_from(weights),
-        body.vertices,
-        blend_from(body.weights),
+        Skinned(garment.vertices, blend_from(weights)),
+        Skinned(body.vertices, blend_from(body.weights), more),
         list(local),
         scene.physics.collision.reach + edge / np.sqrt(3),
     )

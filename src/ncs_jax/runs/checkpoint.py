@@ -79,6 +79,8 @@ def read_run(run: Path) -> dict:
         raise InputError(f"not a run file: {error}", file=path, mend="train again into a new folder") from None
     if not isinstance(facts, dict) or "scene" not in facts or "steps" not in facts:
         raise InputError("not a run file", file=path, field="scene", mend="train again into a new folder")
+    if isinstance(facts["scene"], dict) and isinstance(facts["scene"].get("body"), dict):
+        facts["scene"]["body"].setdefault("correctives", False)  # a run of an earlier version was trained without
     return facts
 
 

@@ -16,7 +16,7 @@ from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
-from ncs_jax.geometry.skinning import Blend, Skeleton, blend, skin, to_rest_axes
+from ncs_jax.geometry.skinning import Blend, Correctives, Skeleton, blend, corrected, skin, to_rest_axes
 
 __all__ = ["Layer", "Model", "RitzModes", "local_rotations", "pose_body", "pose_garment", "pose_rest", "posed_bodies"]
 
@@ -54,7 +54,8 @@ class Model:
     """Constants of a scene. The skeleton holds only the joints that matter, the `source_joints` of the motion's.
 
     `inputs` are the joints that the network reads, the root first. `body` and its `surface` are the part of the body that the
-    garment can touch, `None` in a scene without a body or without collision. To the surface also belong the garments `under`
+    garment can touch, `None` in a scene without a body or without collision; `correctives` are those of the part, `None` for a
+    body without. To the surface also belong the garments `under`
     this one, after the body: each of their vertices goes by a transform of its own, which a track has after those of the
     joints.
     """
@@ -76,6 +77,7 @@ class Model:
     moves: bool = field(default=True, metadata={"static": True})  # False: nothing dynamic is traced
     vibrations: RitzModes | None = None  # where the network swings along them
     under: tuple[Layer, ...] = ()  # garments worn below this one
+    correctives: Correctives | None = None
 
     def with_terms(self, terms: Sequence[OwnTerm]) -> Model:
         """Return the model with terms of one's own beside the scene's: see `energies.terms.OwnTerm`.
@@ -114,10 +116,14 @@ def pose_rest(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array
 
 
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
-    """Return the touchable body in one frame or several, and the garments under this one, m."""
+    """Return the touchable body in one frame or several, and the garments under this one, m.
+
+    A body is skinned linearly, after its pose correctives where it has some: see `skinning.corrected`.
+    """
     lanes = (1,) * (matrices.ndim - 3)
     body, weights = required(model.body, "model.body"), required(model.body_blend, "model.body_blend")
-    body = skin(blend(matrices, weights), body.reshape(body.shape + lanes))
+    carried = blend(matrices, weights)
+    body = skin(carried, corrected(body.reshape(body.shape + lanes), model.correctives, matrices, model.skeleton.parents))
     if not model.under:
         return body
     rest = jnp.concatenate([layer.rest for layer in model.under])

@@ -32,12 +32,9 @@ __all__ = [
     "SimulationSpec",
     "TrainingSpec",
     "load_scene",
-    "packaged",
     "scene_from",
     "template",
 ]
-
-ASSETS = Path(__file__).parents[1] / "assets"
 
 
 def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple = (), **marks: bool):
@@ -53,13 +50,28 @@ def _f(default: Any, text: str, *, low: float = -math.inf, high: float = math.in
     return field(default=default, metadata=meta)
 
 
+def _listed(names: tuple[str, ...] | str) -> tuple[str, ...]:
+    """Return names as a tuple; one may stand by itself."""
+    return names if isinstance(names, tuple) else (names,) if names else ()
+
+
 @dataclass(frozen=True)
 class BodySpec:
     """[body]: the character."""
 
     file: str = _f("ncs:body", "body file, ncs:NAME for a packaged one, or 'none' for a garment without a body")
     joints: tuple[str, ...] = _f((), "names or numbers of joints that the network reads; empty: those that move the garment")
-    part: str = _f("auto", "part of the body that the garment can touch", choices=("auto", "all"))
+    part: tuple[str, ...] | str = _f("auto", "auto: the garment touches what it can reach; all; or names of the meshes to read")
+    betas: tuple[float, ...] | str = _f(
+        (), 'shape of an SMPL model; empty: the mean; "motion": as the motions say', choices=("motion",)
+    )
+    shapes: dict[str, float] = _f({}, "weights of blend shapes by name (glTF, FBX); others as in the file")
+    correctives: bool = _f(True, "use the pose correctives of an SMPL model that has some")
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Return the names of the meshes to read, none for all."""
+        return () if self.part in ("auto", "all", "") else _listed(self.part)
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,7 @@ class GarmentSpec:
     """[garment]: what the character wears."""
 
     file: str = _f("ncs:tshirt", "garment mesh in its rest shape on the resting body")
+    mesh: tuple[str, ...] | str = _f((), "names of the garment's meshes, in a file that holds several objects")
     scale: float = _f(0.0, "metres a unit of the file, 0.01 for cm; 0: as the file says, else 1", low=0, high=1e6)
     up: str = _f("", "axis that is up in the file; empty: as the file says, else y", choices=("", "x", "y", "z"))
     weld: float = _f(0.0, "merge vertices within this distance of each other, m; 0: none", low=0, high=1)
@@ -74,6 +87,11 @@ class GarmentSpec:
     pins: str = _f("", "name of the vertex group that is pinned; empty: none")
     learn_weights: bool = _f(False, "train the skinning weights too")
     over: tuple[str, ...] = _f((), "run folders of trained garments worn below this one; they collide as part of the body")
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Return the names of the garment's meshes, none where none is named."""
+        return _listed(self.mesh)
 
 
 @dataclass(frozen=True)
@@ -216,6 +234,8 @@ class Scene:
     def path(self, name: str) -> Path:
         """Return the path of a file that this scene names."""
         if name.startswith("ncs:"):
+            from ncs_jax.io.packaged import packaged
+
             return packaged(name[4:])
         path = Path(name).expanduser()
         return path if path.is_absolute() or not self.source else Path(self.source).parent / path
@@ -271,15 +291,6 @@ PRESETS: dict[str, dict] = {
 }  # values that `ncs train --preset` puts in place of a scene's own; experiments/speed_accuracy.py measures them
 
 
-def packaged(name: str, suffix: str = ".npz") -> Path:
-    """Return the path of a file that comes with the package."""
-    path = ASSETS / f"{name}{suffix}"
-    if not path.is_file():
-        names = ", ".join(sorted(f"ncs:{p.stem}" for p in ASSETS.glob(f"*{suffix}")))
-        raise InputError("no such packaged file", field=f"ncs:{name}", mend=f"use one of {names}")
-    return path
-
-
 def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     """Read and check a scene file; `ncs:NAME` names a packaged scene.
 
@@ -289,8 +300,11 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
     Raises:
         InputError: the file is missing or not TOML, a key is unknown, or a value has the wrong type or is out of its range.
     """
-    text = str(path)
-    file = packaged(text[4:], ".toml") if text.startswith("ncs:") else Path(path)
+    file = Path(path)
+    if str(path).startswith("ncs:"):
+        from ncs_jax.io.packaged import packaged
+
+        file = packaged(str(path)[4:], ".toml")
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -349,7 +363,7 @@ def _tables(spec, where: str) -> Iterator[str]:
             value, meta = getattr(spec, f.name), f.metadata
             text = f"{f.name} = {json.dumps(value)}"
             note = meta["help"]
-            if meta["choices"]:
+            if meta["choices"] and isinstance(value, str):
                 note += ": " + ", ".join(meta["choices"])
             elif math.isfinite(meta["low"]):
                 note += f"; {'above' if meta['above'] else 'from'} {meta['low']:.10g} to {meta['high']:.10g}"
@@ -387,8 +401,10 @@ def _value(kind, value, meta, source, where):
         return _parse(kind, value, source, where)
     origin = typing.get_origin(kind)
     if origin in (typing.Union, types.UnionType):
-        kind = next(k for k in typing.get_args(kind) if k is not type(None))
-        return None if value is None else _value(kind, value, meta, source, where)
+        kinds = typing.get_args(kind)  # a list, or one word
+        word = isinstance(value, str)
+        meta = {**meta, "choices": meta["choices"] if word else ()}
+        return _value(str if word else next(k for k in kinds if k is not str), value, meta, source, where)
     if origin is tuple:
         if isinstance(value, str | int | float) and not isinstance(value, bool):
             raise InputError("a list expected", file=source, field=where, value=value, mend=f"write [{value!r}]")

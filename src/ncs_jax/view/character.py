@@ -8,7 +8,19 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
-from ncs_jax.geometry.skinning import Blend, Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.geometry.skinning import (
+    Blend,
+    Correctives,
+    Skeleton,
+    blend,
+    blend_from,
+    corrected,
+    correctives_from,
+    forward,
+    skin,
+    to_rest_axes,
+    transforms,
+)
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.build import Assembly, features_from_records
 from ncs_jax.view.animation import Animation, PosedBody
@@ -50,11 +62,12 @@ def body_vertices(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:
     local = axis_angle_to_matrix(jnp.asarray(motion.poses, jnp.float32))
     if body.rest_rotations is not None:
         local = to_rest_axes(local, jnp.asarray(body.rest_rotations, jnp.float32))
-    return np.asarray(_skinned(skeleton, weights, rest, local, jnp.asarray(motion.translation, jnp.float32)))
+    more = None if body.posedirs is None else correctives_from(body.posedirs)
+    return np.asarray(_skinned(skeleton, weights, more, rest, local, jnp.asarray(motion.translation, jnp.float32)))
 
 
 @jax.jit
-def _skinned(skeleton: Skeleton, weights: Blend, rest, local, translation) -> jax.Array:
+def _skinned(skeleton: Skeleton, weights: Blend, more: Correctives | None, rest, local, translation) -> jax.Array:
     """Return vertices over a motion, m, from those at rest, local rotations and the root's places."""
     matrices = transforms(skeleton, forward(skeleton, local, translation))
-    return jax.lax.map(lambda m: skin(blend(m, weights), rest), matrices)
+    return jax.lax.map(lambda m: skin(blend(m, weights), corrected(rest, more, m, skeleton.parents)), matrices)

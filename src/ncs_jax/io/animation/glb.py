@@ -15,7 +15,7 @@ from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 
-__all__ = ["write_glb"]
+__all__ = ["write_glb", "write_glb_body"]
 
 FLOAT, SHORT, INT = 5126, 5123, 5125  # glTF's codes for types of numbers
 VERTICES, INDICES = 34962, 34963  # glTF's codes for the use of a buffer view
@@ -40,8 +40,8 @@ def write_glb(
     lines between two frames. A frame takes 24 bytes a vertex, and the weights take 4 bytes times the frames squared: 32 MB and
     0.4 MB for 300 frames of 4,500 vertices. The sum that a viewer makes equals the frame to rounding of float32.
 
-    A body is a skinned mesh on joints that the same animation turns. The 8 largest weights of a vertex are kept, the largest
-    first, because some viewers know only the first 4.
+    A body is a skinned mesh on joints that the same animation turns, without pose correctives. The 8 largest weights of a
+    vertex are kept, the largest first, because some viewers know only the first 4.
 
     Args:
         path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
@@ -65,6 +65,18 @@ def write_glb(
     _garment(document, vertices, faces, keys)
     if worn_by is not None:
         _body(document, *worn_by, keys)
+    _write(path, document)
+
+
+def write_glb_body(path: str | Path, body: BodyRecord) -> None:
+    """Write a body at rest, as a skinned mesh on its joints; the file appears whole or not at all."""
+    document, still = _Document(), np.zeros((1, len(body.joints), 3))
+    _body(document, body, MotionRecord(still, still[:, 0], 1.0), None)
+    _write(path, document)
+
+
+def _write(path: str | Path, document: _Document) -> None:
+    """Write the JSON and the blocks of a document."""
     text = json.dumps(document.finished(), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     with replacing(path) as new, new.open("xb") as stream:

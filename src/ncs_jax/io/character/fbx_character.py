@@ -2,84 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from ncs_jax.io.character.fbx import Fbx, Record, read_fbx
+from ncs_jax.io.character.fbx import Record, read_fbx
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
-from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, first_that_moves, motion_of, rig_from
-from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.character.fbx_graph import FbxModel, Graph, euler, graph_of, name_of, properties_of
+from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_triangles
+from ncs_jax.io.character.rig import body_of, rig_from
+from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
+from ncs_jax.io.mesh.part import chosen_meshes, one_object
+from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import reading
 
-__all__ = ["fbx_body", "fbx_motion"]
+__all__ = ["fbx_body", "fbx_garment", "fbx_motion"]
 
-DEEPEST = 500  # models from the top to a leaf
 TICK = 46_186_158_000  # a second
-RATES = {
-    1: 120.0, 2: 100.0, 3: 60.0, 4: 50.0, 5: 48.0, 6: 30.0, 7: 30.0, 8: 30 / 1.001, 9: 30 / 1.001, 10: 25.0, 11: 24.0,
-    13: 24 / 1.001, 15: 96.0, 16: 72.0, 17: 60 / 1.001, 18: 120 / 1.001,
-}  # fmt: skip
 ORDERS = ("XYZ", "XZY", "YZX", "YXZ", "ZXY", "ZYX")  # the axis named first turns first
-NUMBERS = (int, float)
 LCL = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 
 
-@dataclass(frozen=True, eq=False)
-class FbxModel:
-    """A node. Its properties come from the node itself, else from the file's template."""
-
-    key: int
-    name: str
-    properties: dict[str, list]
-
-    def vector(self, name: str, default: float = 0.0) -> np.ndarray:
-        """Return the three numbers of a property, each the default where the property is not there."""
-        found = self.properties.get(name, [])[:3]
-        return np.array(found, np.float64) if len(found) == 3 else np.full(3, default)
-
-    def number(self, name: str) -> int:
-        """Return the whole number of a property, 0 where it is not there."""
-        return int(next(iter(self.properties.get(name, [])), 0))
-
-
-@dataclass(frozen=True, eq=False)
-class Graph:
-    """All models, parents before children, and the connections: `below[key]` lists (object, property) under an object.
-
-    `to_metres` (4, 4) leads from the file's axes and unit to metres and Y up. `fps`: frames per second.
-    """
-
-    fbx: Fbx
-    models: list[FbxModel]
-    parents: np.ndarray
-    objects: dict[int, Record]
-    below: dict[int, list[tuple[int, str]]]
-    to_metres: np.ndarray
-    fps: float
-
-    def under(self, key: int, name: str, kind: str = "") -> list[tuple[int, Record, str]]:
-        """Return the objects under one that have a name and, if given, a kind: (key, record, property)."""
-        found = [(k, self.objects[k], p) for k, p in self.below.get(key, ()) if k in self.objects]
-        return [(k, r, p) for k, r, p in found if r.name == name and kind in ("", r.value(2, str, ""))]
-
-
-def fbx_body(path: str | Path) -> BodyRecord:
+def fbx_body(path: str | Path, part: Sequence[str] = (), shapes: Mapping[str, float] | None = None) -> BodyRecord:
     """Read the skinned character of an .fbx in the pose in which it was bound, m, Y up: see `rig_from`.
 
-    Units and axes are those that the file states. All skinned meshes are joined, and polygons become triangles. Meshes without
-    a skin, shapes and materials are ignored.
+    Units and axes are those that the file states. All skinned meshes are joined, or those that `part` names by model, mesh or
+    material. Blend shapes have the file's weights, or those of `shapes`. Polygons become triangles, see `triangulate`. Meshes
+    without a skin are ignored.
     """
     with reading(Path(path), "FBX"):
-        graph = _graph(read_fbx(path))
-        pieces = _pieces(graph)
+        graph = graph_of(read_fbx(path))
+        pieces = fbx_pieces(graph, part, shapes)
         if not pieces:
             raise graph.fbx.wrong("a skinned mesh expected", "skins", "none", "export the character with its skin")
         return body_of(rig_from(graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces))
+
+
+def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
+    """Read a mesh of an .fbx as it stands, or as it was bound if it has a skin, m, Y up.
+
+    Args:
+        path: the file. mesh: names of models, meshes or materials, which are joined. None: the file must hold one mesh.
+    """
+    with reading(Path(path), "FBX"):
+        graph = graph_of(read_fbx(path))
+        file, drawn = graph.fbx.file, fbx_meshes(graph)
+        named = [d.named for d in drawn]
+        chosen = chosen_meshes(file, "garment.mesh", mesh, named)
+        if not mesh:
+            one_object(file, "garment.mesh", named)
+        worn = [d for d, wanted in zip(drawn, chosen, strict=True) if wanted]
+        if not worn:
+            raise graph.fbx.wrong("a mesh expected", "Objects", "none", "export the garment's mesh")
+        worlds = _worlds(graph)
+        if all(d.skin is not None for d in worn):
+            names = [m.name for m in graph.models]
+            rig = rig_from(file, names, graph.parents, worlds, fbx_pieces(graph, worn=worn))
+            return RawGarment(file, rig.vertices, rig.faces, weights=rig.weights, joint_names=rig.names, notes=rig.notes)
+        parts, start = [], 0
+        for d in worn:
+            (x, faces), matrix = fbx_triangles(graph, d, {}), worlds[d.model]
+            outward = faces if np.linalg.det(matrix[:3, :3]) > 0 else faces[:, ::-1]
+            parts.append((x @ matrix[:3, :3].T + matrix[:3, 3], outward + start))
+            start += len(x)
+        return RawGarment(file, np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]))
 
 
 def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
@@ -89,91 +78,16 @@ def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
     in which the models stand.
     """
     with reading(Path(path), "FBX"):
-        graph = _graph(read_fbx(path))
+        graph = graph_of(read_fbx(path))
         begin, end, curves, notes = _animation(graph, name)
-        pieces = _pieces(graph)
+        pieces = fbx_pieces(graph)
         turning = [m for (m, p, _), c in curves.items() if p == "Lcl Rotation" and np.ptp(c.values) > 0.01]
         rig = rig_from(
             graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces, sorted(set(turning))
         )
         wanted = rig.nodes.tolist()
         found = motion_of(rig, (begin, end, graph.fps), lambda times: _worlds(graph, wanted, curves, times))
-        return replace(found, notes=notes)
-
-
-def _graph(fbx: Fbx) -> Graph:
-    """Return the models of a file, sorted by depth, with what is connected to them."""
-    objects = {r.value(0, int, 0): r for r in fbx.root.first("Objects").inner}
-    below: dict[int, list[tuple[int, str]]] = {}
-    for line in fbx.root.first("Connections").all("C"):
-        if line.value(0, str, "") in ("OO", "OP"):
-            below.setdefault(line.value(2, int, 0), []).append((line.value(1, int, 0), line.value(3, str, "")))
-    template: dict[str, list] = {}
-    for defined in fbx.root.first("Definitions").all("ObjectType"):
-        if defined.value(0, str, "") == "Model":
-            template = _properties(defined.first("PropertyTemplate"))
-    keys = [k for k, r in objects.items() if r.name == "Model"]
-    if not 0 < len(keys) <= MOST_NODES:
-        raise fbx.wrong(f"1 to {MOST_NODES} models expected", "Objects", len(keys), "export one character")
-    place = {k: i for i, k in enumerate(keys)}
-    parents = np.full(len(keys), -1, np.int32)
-    for above, inner in below.items():
-        for key, name in inner:
-            if above in place and key in place and not name:
-                parents[place[key]] = place[above]
-    depth = np.zeros(len(keys), int)
-    for i in range(len(keys)):
-        above = i
-        while (above := int(parents[above])) >= 0:
-            if (steps := int(depth[i]) + 1) > DEEPEST:
-                raise fbx.wrong(f"a tree at most {DEEPEST} models deep expected", "Connections", "deeper, or a circle")
-            depth[i] = steps
-    order = np.argsort(depth, kind="stable")
-    rank = np.argsort(order)
-    models = [FbxModel(keys[i], _name(objects[keys[i]]), template | _properties(objects[keys[i]])) for i in order]
-    parents = np.array([rank[parents[i]] if parents[i] >= 0 else -1 for i in order], np.int32)
-    return Graph(fbx, models, parents, objects, below, *_settings(fbx))
-
-
-def _name(record: Record) -> str:
-    """Return the name of an object: `Hips` for a binary file's `Hips\\0\\1Model` and for a text file's `Model::Hips`."""
-    name = record.value(1, str, "").split("\0", 1)[0]
-    return name.split("::", 1)[1] if name.startswith(("Model::", "AnimStack::")) else name
-
-
-def _properties(record: Record) -> dict[str, list]:
-    """Return the numbers of each property in a record's Properties70."""
-    lines = record.first("Properties70").all("P")
-    return {line.value(0, str, ""): [v for v in line.values[4:] if isinstance(v, NUMBERS) and abs(v) < 1e30] for line in lines}
-
-
-def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
-    """Return the matrix (4, 4) from the file's axes and unit to metres and Y up, and the frames per second."""
-    given = _properties(fbx.root.first("GlobalSettings"))
-
-    def number(name: str, default: float) -> float:
-        return float(next(iter(given.get(name, [])), default))
-
-    out = np.zeros((4, 4))
-    for row, (axis, usual) in enumerate((("CoordAxis", 0), ("UpAxis", 1), ("FrontAxis", 2))):
-        which, sign = number(axis, usual), number(f"{axis}Sign", 1)
-        if which not in (0, 1, 2) or sign not in (-1, 1):
-            raise fbx.wrong("an axis 0, 1 or 2 with sign 1 or -1 expected", f"GlobalSettings {axis}", (which, sign))
-        out[row, int(which)] = sign
-    unit = number("UnitScaleFactor", 1.0)
-    if abs(np.linalg.det(out[:3, :3])) != 1 or not 1e-6 < unit < 1e6:
-        raise fbx.wrong("three different axes, and a unit above 0, expected", "GlobalSettings", unit)
-    out[:3] *= unit / 100  # the unit is in centimetres
-    out[3, 3] = 1
-    mode = int(number("TimeMode", 6))
-    fps = RATES.get(mode, number("CustomFrameRate", 30.0) if mode == 14 else 30.0)
-    return out, fps if 10 <= fps <= 240 else 30.0
-
-
-def _euler(degrees: np.ndarray, order: str = "XYZ") -> np.ndarray:
-    """Return rotation matrices (..., 3, 3) of angles about X, Y and Z (..., 3), degrees; the axis named first turns first."""
-    angles = degrees[..., ["XYZ".index(axis) for axis in order]].reshape(-1, 3)
-    return Rotation.from_euler(order.lower(), angles, degrees=True).as_matrix().reshape(*degrees.shape, 3)
+        return replace(found, notes=(*notes, *found.notes))
 
 
 def _local(model: FbxModel, moved: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,8 +100,8 @@ def _local(model: FbxModel, moved: dict[str, np.ndarray]) -> tuple[np.ndarray, n
         for name, default in (("Translation", 0.0), ("Rotation", 0.0), ("Scaling", 1.0))
     )
     order = model.number("RotationOrder")
-    before, after = _euler(model.vector("PreRotation")), _euler(model.vector("PostRotation"))
-    rotation = before @ _euler(turn, ORDERS[order] if 0 <= order < 6 else "XYZ") @ after.T
+    before, after = euler(model.vector("PreRotation")), euler(model.vector("PostRotation"))
+    rotation = before @ euler(turn, ORDERS[order] if 0 <= order < 6 else "XYZ") @ after.T
     pivot, scaled = model.vector("RotationPivot"), model.vector("ScalingPivot")
     inner = model.vector("ScalingOffset") + scaled - scale * scaled - pivot
     shift = place + model.vector("RotationOffset") + pivot + np.einsum("...ab,...b->...a", rotation, inner)
@@ -252,7 +166,7 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
     Without a name it is the first that moves a model: what Mixamo writes begins with an empty take.
     """
     stacks = [(k, r) for k, r in graph.objects.items() if r.name == "AnimationStack"]
-    names = [_name(r) for _, r in stacks]
+    names = [name_of(r) for _, r in stacks]
     place = {m.key: i for i, m in enumerate(graph.models)}
     above: dict[int, list[tuple[int, str]]] = {}
     for owner, inner in graph.below.items():
@@ -270,9 +184,9 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
     key, stack = stacks[number]
     layers = list(dict.fromkeys(layer for layer, _, _, _ in _curve_nodes(graph, key, above)))
     if len(layers) > 1:
-        called = ", ".join(_name(graph.objects[layer]) for layer in layers)
+        called = ", ".join(name_of(graph.objects[layer]) for layer in layers)
         notes = (*notes, f"of its layers ({called}) the first that moves a joint counts; bake them to have all")
-    times = _properties(stack)
+    times = properties_of(stack)
     begin, end = (next(iter(times.get(n, [])), 0) / TICK for n in ("LocalStart", "LocalStop"))
     if not end > begin:
         begin, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
@@ -306,69 +220,8 @@ def _curves(graph: Graph, stack: int, above: dict) -> dict[tuple[int, str, int],
 
 def _still(record: Record, model: int, kind: str, curves: dict) -> None:
     """Add constant curves, where the curve node gives a value, for axes that have no curve."""
-    given = _properties(record)
+    given = properties_of(record)
     for axis, letter in enumerate("XYZ"):
         value = given.get(f"d|{letter}", [])
         if value and (model, kind, axis) not in curves:
             curves[model, kind, axis] = Curve(np.zeros(1), np.array(value[:1], np.float64), np.zeros((1, 2)), np.zeros(1, int))
-
-
-def _pieces(graph: Graph) -> list[Piece]:
-    """Return the triangles under each skin."""
-    found = []
-    for number, model in enumerate(graph.models):
-        for key, mesh, _ in graph.under(model.key, "Geometry", "Mesh"):
-            for skin, _, _ in graph.under(key, "Deformer", "Skin")[:1]:
-                found.append(_piece(graph, number, mesh, skin))
-    return found
-
-
-def _piece(graph: Graph, number: int, mesh: Record, skin: int) -> Piece:
-    """Return the triangles of one mesh with the joints and weights of its skin."""
-    fbx, model = graph.fbx, graph.models[number]
-    where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
-    x = fbx.array(mesh, "Vertices", where)
-    corners = fbx.array(mesh, "PolygonVertexIndex", where, whole=True)
-    if not len(x) or len(x) % 3 or not len(corners):
-        raise fbx.wrong("vertices and polygons expected", where, f"{len(x)} numbers, {len(corners)} corners")
-    x = x.reshape(-1, 3)
-    last = corners < 0
-    corners = np.where(last, -1 - corners, corners)
-    if corners.max() >= len(x) or not last[-1]:
-        raise fbx.wrong(f"whole polygons of the {len(x)} vertices expected", where, int(corners.max()))
-    rows: list[tuple[np.ndarray, np.ndarray]] = []
-    nodes, binds, bounds = [], [], []
-    for key, cluster, _ in graph.under(skin, "Deformer", "Cluster"):
-        bones = [place[k] for k, _, _ in graph.under(key, "Model")]
-        own = fbx.array(cluster, "Indexes", where, whole=True), fbx.array(cluster, "Weights", where)
-        to_bone, to_world = fbx.array(cluster, "Transform", where), fbx.array(cluster, "TransformLink", where)
-        if (
-            len(bones) != 1
-            or not len(to_bone) == len(to_world) == 16
-            or len(own[0]) != len(own[1])
-            or (own[0].size and own[0].max() >= len(x))
-        ):
-            raise fbx.wrong("a joint, its place, and weights of vertices that are there expected", where, _name(cluster))
-        rows.append(own)
-        nodes.append(bones[0])
-        binds.append(to_bone.reshape(4, 4).T)
-        bounds.append(graph.to_metres @ to_world.reshape(4, 4).T @ binds[-1])
-    if not nodes or min((r[0].min() for r in rows if r[0].size), default=-1) < 0:
-        raise fbx.wrong("vertices that joints move expected", where, f"{len(nodes)} joints")
-    vertex, weight = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-    owner = np.repeat(np.arange(len(rows)), [len(r[0]) for r in rows])
-    order = np.argsort(vertex, kind="stable")
-    vertex, weight, owner = vertex[order], weight[order], owner[order]
-    slot = np.arange(len(vertex)) - np.searchsorted(vertex, vertex)
-    owners = np.zeros((len(x), int(slot.max()) + 1), np.int64)
-    weights = np.zeros(owners.shape)
-    owners[vertex, slot], weights[vertex, slot] = owner, np.maximum(weight, 0)
-    sums = weights.sum(axis=1, keepdims=True)
-    weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
-    scale = model.vector("GeometricScaling", 1.0)
-    x = (x * scale) @ _euler(model.vector("GeometricRotation")).T + model.vector("GeometricTranslation")
-    counts = np.diff(np.flatnonzero(last), prepend=-1)
-    whole = np.repeat(counts > 2, counts)  # what has two corners is an edge
-    faces = triangulate(fbx.file, x, counts[counts > 2], corners[whole])
-    faces = faces if scale.prod() > 0 else faces[:, ::-1]
-    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])

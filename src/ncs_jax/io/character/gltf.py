@@ -1,4 +1,4 @@
-"""The container of glTF 2.0 (.glb, .gltf): JSON, the buffers that it names, and the typed arrays in them."""
+"""The container of glTF 2.0 (.glb, .vrm, .gltf): JSON, the buffers that it names, and the typed arrays in them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ import numpy as np
 from ncs_jax.errors import InputError
 from ncs_jax.io.tables.files import LARGEST, readable, reading, unpackable
 
-__all__ = ["Gltf", "read_gltf"]
+__all__ = ["BINARY", "COMPONENTS", "WIDTHS", "Gltf", "read_gltf"]
 
+MESHOPT = "export without mesh compression; gltfpack compresses only with -c or -cc"
 TEXT = 128 * 2**20  # bytes of JSON, at most; parsed it takes some twenty times as many
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Extensions that a file may require, because they change neither shape nor movement. With others it would be misread.
 HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_mesh_quantization", "KHR_xmp",
-    "KHR_animation_pointer", "VRM", "VRMC_",
+    "KHR_animation_pointer", "VRM", "VRMC_", "KHR_draco_mesh_compression",
 )  # fmt: skip
+BINARY = (".glb", ".vrm")  # a .vrm is a .glb under another name
 
 
 @dataclass(eq=False)
@@ -109,7 +111,7 @@ class Gltf:
         count = self.whole("count", one, f"{where} count", 2**32)
         self._take(where, count * width * 8)
         if "bufferView" in one:
-            array = self._rows(one, where, count, width, dtype)
+            array = self.rows(one, where, count, width, dtype)
         else:
             array = np.zeros((count, width), dtype)
         if "sparse" in one:
@@ -118,15 +120,24 @@ class Gltf:
             at = self.object("indices", sparse, f"{where} sparse")
             if (number := at.get("componentType")) not in (5121, 5123, 5125):
                 raise self.wrong("unsigned whole numbers expected", f"{where} sparse indices", number)
-            place = self._rows(at, f"{where} sparse indices", changed, 1, np.dtype(COMPONENTS[number]))[:, 0]
+            place = self.rows(at, f"{where} sparse indices", changed, 1, np.dtype(COMPONENTS[number]))[:, 0]
             if (place >= count).any():
                 raise self.wrong(f"numbers below {count} expected", f"{where} sparse indices", int(place.max()))
             values = self.object("values", sparse, f"{where} sparse")
-            array[place] = self._rows(values, f"{where} sparse values", changed, width, dtype)
-        if one.get("normalized", False) is True and dtype.kind in "iu":
-            return np.maximum(array / float(np.iinfo(dtype).max), -1)
+            array[place] = self.rows(values, f"{where} sparse values", changed, width, dtype)
+        return self._checked(array, where, one.get("normalized", False) is True)
+
+    def keep(self, index: int, array: np.ndarray, where: str, normalized: bool) -> None:
+        """Take an array (count, width), unpacked elsewhere, as that of an accessor."""
+        self._take(where, array.size * 8)
+        self.arrays[index] = self._checked(array, where, normalized)
+
+    def _checked(self, array: np.ndarray, where: str, normalized: bool) -> np.ndarray:
+        """Return an array whose numbers are finite; normalized integers become float64, -1 to 1."""
+        if normalized and array.dtype.kind in "iu":
+            return np.maximum(array / float(np.iinfo(array.dtype).max), -1)
         with np.errstate(invalid="ignore"):
-            if dtype.kind == "f" and not (np.abs(array) < 1e30).all():
+            if array.dtype.kind == "f" and not (np.abs(array) < 1e30).all():
                 row = int(np.argmax(~(np.abs(array) < 1e30).all(axis=1)))
                 raise self.wrong("finite numbers expected", f"{where}, entry {row}", array[row].tolist())
         return array
@@ -138,13 +149,13 @@ class Gltf:
         if self.taken > LARGEST:
             raise self.wrong(f"at most {LARGEST} bytes in all accessors expected", where, self.taken, "split the file")
 
-    def _rows(self, owner: dict, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
+    def rows(self, owner: dict, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
         """Return a new array of the rows in a buffer view, one row every `byteStride` bytes."""
         views = self.objects("bufferViews")
         view = views[self.whole("bufferView", owner, f"{where} bufferView", len(views))]
         packed = [n for n in self.object("extensions", view, f"{where} bufferView") if n.endswith("meshopt_compression")]
         if packed:
-            raise self.wrong("plain buffers expected", where, packed[0], "export without mesh compression")
+            raise self.wrong("plain buffers expected", where, packed[0], MESHOPT)
         data = self._buffer(self.whole("buffer", view, f"{where} buffer", len(self.objects("buffers"))))
         begin = self.whole("byteOffset", view, f"{where} view's byteOffset", 2**40, 0)
         length = self.whole("byteLength", view, f"{where} view's byteLength", 2**40)
@@ -197,17 +208,17 @@ class Gltf:
 
 
 def read_gltf(path: str | Path) -> Gltf:
-    """Open a .glb or .gltf and check its header and JSON; accessors are read when they are asked for.
+    """Open a .glb, .vrm or .gltf and check its header and JSON; accessors are read when they are asked for.
 
     Buffers may be in the file, in a data URI, or in another file of the same folder or below. Nothing else is opened.
     """
     file = readable(path)
-    size, most = file.stat().st_size, LARGEST if file.suffix.lower() == ".glb" else TEXT
+    size, most = file.stat().st_size, LARGEST if file.suffix.lower() in BINARY else TEXT
     if size > most:
         raise InputError(f"at most {most} bytes expected", file=file, value=f"{size} bytes", mend="write a .glb, or split it")
     with reading(file, "glTF"):
         text, chunk = file.read_bytes(), None
-        if file.suffix.lower() == ".glb":
+        if file.suffix.lower() in BINARY:
             text, chunk = _chunks(file, text)
         tree = json.loads(text.decode("utf-8-sig"), parse_constant=_no_number)
         if not isinstance(tree, dict):
@@ -225,7 +236,7 @@ def read_gltf(path: str | Path) -> Gltf:
                 "an extension that is not read here",
                 "extensionsRequired",
                 foreign[0],
-                "export without it (mesh compression: off)",
+                MESHOPT if foreign[0].endswith("meshopt_compression") else "export without it",
             )
         return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,12 +10,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ncs_jax.io.character.gltf import Gltf, read_gltf
-from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, clip_named, first_that_moves, motion_of, rig_from, unique_names
+from ncs_jax.io.character.gltf_mesh import (
+    Drawn,
+    check_shapes,
+    drawn_triangles,
+    floats_of,
+    oriented,
+    skinned_piece,
+    texture_coordinates,
+    triangles_of,
+)
+from ncs_jax.io.character.hierarchy import path_to_root
+from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, rig_from, unique_names
+from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
 from ncs_jax.io.character.spline import hermite
+from ncs_jax.io.mesh.part import chosen_meshes, one_object
+from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import reading
 
-__all__ = ["gltf_body", "gltf_motion"]
+__all__ = ["gltf_body", "gltf_garment", "gltf_motion"]
 
 DEEPEST = 500  # nodes from the top to a leaf
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
@@ -44,23 +58,68 @@ class Channel:
     mode: str
 
 
-def gltf_body(path: str | Path) -> BodyRecord:
-    """Read the skinned character of a .glb or .gltf in the pose in which it was bound, m, Y up: see `rig_from`.
+def gltf_body(path: str | Path, part: Sequence[str] = (), shapes: Mapping[str, float] | None = None) -> BodyRecord:
+    """Read the skinned character of a .glb, .vrm or .gltf in the pose in which it was bound, m, Y up: see `rig_from`.
 
-    All meshes under a skin are joined. Vertices that differ only in texture coordinates and normals are merged. Meshes without
-    a skin, morph targets and materials are ignored.
+    All meshes under a skin are joined, or those that `part` names by object, mesh or material. Morph targets have the file's
+    weights, or those of `shapes`. Vertices that differ only in texture coordinates and normals are merged. Meshes without a
+    skin are ignored.
     """
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):
         nodes = _nodes(gltf)
-        pieces = _pieces(gltf)
+        pieces = _pieces(gltf, part, shapes)
         if not pieces:
             raise gltf.wrong("a skinned mesh expected", "skins", "none", "export the character with its skin")
         return body_of(rig_from(gltf.file, nodes.names, nodes.parents, _worlds(nodes, range(len(nodes.names))), pieces))
 
 
+def gltf_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
+    """Read a mesh of a .glb, .vrm or .gltf as it stands in the file's scene, m, Y up; a skinned one as it was bound.
+
+    Args:
+        path: the file. mesh: names of objects, meshes or materials, which are joined. None: the file must hold one object.
+    """
+    gltf = read_gltf(path)
+    with reading(gltf.file, "glTF"):
+        nodes = _nodes(gltf)
+        drawn = drawn_triangles(gltf, _in_scene(gltf, nodes))
+        named = [d.named for d in drawn]
+        chosen = chosen_meshes(gltf.file, "garment.mesh", mesh, named)
+        if not mesh:
+            one_object(gltf.file, "garment.mesh", named)
+        worn = [d for d, wanted in zip(drawn, chosen, strict=True) if wanted]
+        if not worn:
+            raise gltf.wrong("a mesh expected", "meshes", "none", "export the garment's mesh")
+        worlds = _worlds(nodes, range(len(nodes.names)))
+        if all(d.skin >= 0 for d in worn):
+            rig = rig_from(gltf.file, nodes.names, nodes.parents, worlds, _pieces(gltf, worn=worn))
+            return RawGarment(
+                gltf.file, rig.vertices, rig.faces, splits=True, weights=rig.weights, joint_names=rig.names, notes=rig.notes
+            )
+        parts, start = [], 0
+        for d in worn:
+            x, faces = triangles_of(gltf, d, {})
+            parts.append((x @ worlds[d.node, :3, :3].T + worlds[d.node, :3, 3], oriented(faces, worlds[d.node]) + start))
+            start += len(x)
+        maps = [texture_coordinates(gltf, d, len(x)) for d, (x, _) in zip(worn, parts, strict=True)]
+        uv = None if any(m is None for m in maps) else np.concatenate([m for m in maps if m is not None])
+        x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+        return RawGarment(gltf.file, x, faces, uv, splits=True)
+
+
+def _in_scene(gltf: Gltf, nodes: Nodes) -> list[int]:
+    """Return the nodes of the scene that is shown, in their order; all where the file has no scene."""
+    scenes = gltf.objects("scenes")
+    if not scenes:
+        return list(range(len(nodes.names)))
+    shown = gltf.whole("scene", gltf.tree, "scene", len(scenes), 0)
+    roots = set(gltf.wholes("nodes", scenes[shown], f"scene {shown}", len(nodes.names)))
+    return [n for n in range(len(nodes.names)) if roots & set(path_to_root(nodes.parents, n))]
+
+
 def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """Read an animation of a .glb or .gltf since the pose of `gltf_body`; the first that moves, or the named.
+    """Read an animation of a .glb, .vrm or .gltf since the pose of `gltf_body`; the first that moves, or the named.
 
     The frames are the keys, if they have a constant rate of 10 to 240 a second; else there are 30 a second, from the first key
     to the last. Joints without keys keep their node's place. In a file without a skin, the rest pose is the one in which the
@@ -75,7 +134,7 @@ def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
         rest = _worlds(nodes, range(len(nodes.names)))
         rig = rig_from(gltf.file, nodes.names, nodes.parents, rest, pieces, turning)
         found = motion_of(rig, _span(tracks), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
-        return replace(found, notes=notes)
+        return replace(found, notes=(*notes, *found.notes))
 
 
 def _nodes(gltf: Gltf) -> Nodes:
@@ -141,92 +200,23 @@ def _worlds(nodes: Nodes, wanted: Sequence[int], tracks: Sequence[Channel] = (),
     return np.stack([np.broadcast_to(world[n], (len(times), 4, 4)) for n in wanted], axis=1)
 
 
-def _pieces(gltf: Gltf) -> list[Piece]:
-    """Return the triangles under each skin."""
-    meshes, skins = gltf.objects("meshes"), gltf.objects("skins")
-    found: dict[int, list] = {}
-    for i, node in enumerate(gltf.objects("nodes")):
-        if "skin" in node and "mesh" in node:
-            skin = gltf.whole("skin", node, f"node {i} skin", len(skins))
-            mesh = gltf.whole("mesh", node, f"node {i} mesh", len(meshes))
-            for p, primitive in enumerate(gltf.objects("primitives", meshes[mesh], f"mesh {mesh}")):
-                if gltf.whole("mode", primitive, f"mesh {mesh}, primitive {p} mode", 7, 4) >= 4:  # not points or lines
-                    found.setdefault(skin, []).append((f"mesh {mesh}, primitive {p}", primitive))
-    return [_piece(gltf, skin, primitives) for skin, primitives in found.items()]
-
-
-def _piece(gltf: Gltf, skin: int, primitives: list[tuple[str, dict]]) -> Piece:
-    """Return the triangles of the primitives under one skin, with its joints and inverse bind matrices."""
-    one, where = gltf.objects("skins")[skin], f"skin {skin}"
-    joints = np.array(gltf.wholes("joints", one, where, len(gltf.objects("nodes"))), np.int64)
-    if not len(joints):
-        raise gltf.wrong("joints expected", where, "none")
-    if "inverseBindMatrices" not in one:
-        raise gltf.wrong("inverseBindMatrices expected: they say where the joints rest", where, "none")
-    inverse = _floats(gltf, one, "inverseBindMatrices", where, ("MAT4",))
-    if len(inverse) < len(joints):
-        raise gltf.wrong(f"{len(joints)} matrices expected, one a joint", f"{where} inverseBindMatrices", len(inverse))
-    inverse = inverse[: len(joints)].reshape(-1, 4, 4).swapaxes(1, 2)
-    if np.abs(inverse[:, 3] - [0, 0, 0, 1]).max() > 1e-4:
-        raise gltf.wrong("matrices with (0, 0, 0, 1) below expected", f"{where} inverseBindMatrices")
-    parts, start = [], 0
-    for where, primitive in primitives:
-        x, faces, owners, weights = _triangles(gltf, primitive, where, len(joints))
-        parts.append((x, faces + start, owners, weights))
-        start += len(x)
-    width = max(p[2].shape[1] for p in parts)
-    owners, weights = (np.concatenate([np.pad(p[k], ((0, 0), (0, width - p[k].shape[1]))) for p in parts]) for k in (2, 3))
-    return Piece(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), owners, weights, joints, inverse)
-
-
-def _triangles(gltf: Gltf, one: dict, where: str, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices (V, 3), faces (F, 3), and for each vertex the joints that move it and their weights (V, 4, 8, ...)."""
-    attributes = gltf.object("attributes", one, where)
-    if "POSITION" not in attributes and "KHR_draco_mesh_compression" in gltf.object("extensions", one, where):
-        raise gltf.wrong("plain arrays expected", where, "KHR_draco_mesh_compression", "export without mesh compression")
-    x = _floats(gltf, attributes, "POSITION", where, ("VEC3",))
-    owners, weights = [], []
-    for number in range(8):
-        if number and f"JOINTS_{number}" not in attributes:
-            break
-        owner = _array(gltf, attributes, f"JOINTS_{number}", where, ("VEC4",))
-        weight = _floats(gltf, attributes, f"WEIGHTS_{number}", where, ("VEC4",))
-        if owner.dtype.kind != "u" or not len(owner) == len(weight) == len(x):
-            raise gltf.wrong(
-                f"whole numbers and weights for each of the {len(x)} vertices expected", f"{where} JOINTS_{number}",
-                f"{owner.dtype}, {len(owner)} and {len(weight)}",
-            )  # fmt: skip
-        owner = np.where(weight > 0, owner, 0)
-        if (owner >= joints).any():
-            raise gltf.wrong(f"joints from 0 to {joints - 1} expected", f"{where} JOINTS_{number}", int(owner.max()))
-        owners.append(owner.astype(np.int64))
-        weights.append(np.maximum(weight, 0))
-    if "indices" in one:
-        corners = _array(gltf, one, "indices", where, ("SCALAR",))[:, 0]
-        if corners.dtype.kind != "u" or (corners >= len(x)).any():
-            raise gltf.wrong(f"numbers from 0 to {len(x) - 1} expected", f"{where} indices", corners.max(initial=0).item())
-        corners = corners.astype(np.int64)
-    else:
-        corners = np.arange(len(x))
-    if len(corners) < 3:
-        raise gltf.wrong("triangles expected", where, f"{len(corners)} corners")
-    mode = one.get("mode", 4)
-    if mode == 4:
-        faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
-    elif mode == 5:  # a strip: every other triangle is turned around
-        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-        faces[1::2] = faces[1::2, [1, 0, 2]]
-    else:
-        faces = np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
-    return x, faces, np.concatenate(owners, axis=1), np.concatenate(weights, axis=1)
-
-
-def _array(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ...]) -> np.ndarray:
-    return gltf.accessor(gltf.whole(name, owner, f"{where} {name}", len(gltf.objects("accessors"))), kinds, f"{where} {name}")
-
-
-def _floats(gltf: Gltf, owner: dict, name: str, where: str, kinds: tuple[str, ...]) -> np.ndarray:
-    return _array(gltf, owner, name, where, kinds).astype(np.float64)
+def _pieces(
+    gltf: Gltf,
+    part: Sequence[str] = (),
+    shapes: Mapping[str, float] | None = None,
+    worn: Sequence[Drawn] = (),
+) -> list[Piece]:
+    """Return the triangles under each skin, chosen by `part` or `worn`; the others are there too: they tell of the joints."""
+    drawn = [d for d in drawn_triangles(gltf, range(len(gltf.objects("nodes")))) if d.skin >= 0]
+    chosen = chosen_meshes(gltf.file, "body.part", part, [d.named for d in drawn])
+    if worn:
+        places = {(d.node, d.where) for d in worn}
+        chosen = np.array([(d.node, d.where) in places for d in drawn])
+    check_shapes(gltf, shapes or {}, [d for d, wanted in zip(drawn, chosen, strict=True) if wanted])
+    found: dict[tuple[int, bool], list[Drawn]] = {}
+    for one, wanted in zip(drawn, chosen.tolist(), strict=True):
+        found.setdefault((one.skin, wanted), []).append(one)
+    return [skinned_piece(gltf, skin, some, shapes or {}, wanted) for (skin, wanted), some in found.items()]
 
 
 def _animation(gltf: Gltf, nodes: Nodes, name: str) -> tuple[list[Channel], tuple[str, ...]]:
@@ -270,8 +260,8 @@ def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Chann
     mode = gltf.text("interpolation", sampler, label) or "LINEAR"
     if mode not in ("LINEAR", "STEP", "CUBICSPLINE"):
         raise gltf.wrong("LINEAR, STEP or CUBICSPLINE expected", label, mode)
-    times = _floats(gltf, sampler, "input", label, ("SCALAR",))[:, 0]
-    values = _floats(gltf, sampler, "output", label, (f"VEC{PATHS[path]}",))
+    times = floats_of(gltf, sampler, "input", label, ("SCALAR",))[:, 0]
+    values = floats_of(gltf, sampler, "output", label, (f"VEC{PATHS[path]}",))
     if not len(times) or len(values) != len(times) * (3 if mode == "CUBICSPLINE" else 1):
         raise gltf.wrong("as many values as times expected (CUBICSPLINE: three)", label, f"{len(values)} for {len(times)}")
     if times[0] < 0 or (np.diff(times) <= 0).any():

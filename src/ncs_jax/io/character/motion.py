@@ -12,7 +12,8 @@ from ncs_jax.io.character.fbx_character import fbx_motion
 from ncs_jax.io.character.gltf_character import gltf_motion
 from ncs_jax.io.character.motion_table import FIELDS, chosen_frames, table_motion
 from ncs_jax.io.character.moving_root import bvh_from_moving_root
-from ncs_jax.io.character.rig import split_clip
+from ncs_jax.io.character.rig_motion import split_clip
+from ncs_jax.io.packaged import resolved
 from ncs_jax.io.records import MotionRecord
 from ncs_jax.io.tables.hdf5 import read_hdf5
 from ncs_jax.io.tables.npz import read_npz
@@ -25,6 +26,7 @@ READERS: dict[str, Callable[[str, str], MotionRecord]] = {
     ".bvh": lambda name, root: _bvh_motion(name, root),
     ".glb": gltf_motion,
     ".gltf": gltf_motion,
+    ".vrm": gltf_motion,
     ".fbx": fbx_motion,
 }
 FORMATS = (*TABLES, *READERS)
@@ -45,21 +47,21 @@ def read_motion(
     the first animation that moves is read, and the largest skeleton. The record's notes say what was found and done.
 
     Args:
-        path: the file. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end, and numbers below 0
-            count from the end. Other frames may hold numbers that are not finite. scale: metres a unit of the file's lengths,
-            for .bvh often 0.01 or 0.0254.
+        path: the file, or ncs:NAME. frame_range: (start, stop), frames start to stop - 1; a stop of None is the end, and
+            numbers below 0 count from the end. Other frames may hold numbers that are not finite. scale: metres a unit of the
+            file's lengths, for .bvh often 0.01 or 0.0254.
 
     Raises:
         InputError: the file cannot be read; or shapes disagree, a chosen frame has a number that is not finite or something
             that is no rotation, there is no frame, or the frame rate is not above 0.
     """
-    name, clip = split_clip(path)
+    name, clip = split_clip(resolved(path))
     if (suffix := Path(name).suffix.lower()) not in FORMATS:
         raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
     if not 0 < scale < 1e6:
         raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
     if suffix in TABLES:
-        found = table_motion(TABLES[suffix](path, FIELDS.__contains__), frame_range)
+        found = table_motion(TABLES[suffix](name, FIELDS.__contains__), frame_range)
     else:
         found = READERS[suffix](name, clip)
         chosen = select(Path(name), len(found.poses), frame_range)

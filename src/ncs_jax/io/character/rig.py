@@ -1,22 +1,18 @@
-"""A skinned character as 4 x 4 matrices, as .glb and .fbx hold it, and the body and the motion made from it."""
+"""A skinned character as 4 x 4 matrices, as glTF and FBX hold it, and the body made from it."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
-from unicodedata import normalize
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.hierarchy import by_depth, lowest_common, nearest_parents, path_to_root
-from ncs_jax.io.character.moving_root import SLIDE, SPARE, check_slides, moving_root
 from ncs_jax.io.mesh.weld import distinct
-from ncs_jax.io.records import BodyRecord, MotionRecord
+from ncs_jax.io.records import BodyRecord
 from ncs_jax.io.tables.files import LARGEST
 
 __all__ = [
@@ -24,23 +20,14 @@ __all__ = [
     "Piece",
     "Rig",
     "body_of",
-    "clip_named",
-    "first_that_moves",
-    "motion_of",
     "quarter_turns",
+    "rest_rotations",
     "rig_from",
-    "split_clip",
     "unique_names",
 ]
 
-GIVE = 0.01  # m by which a bone may change, and share by which a joint may scale; more is an error, less is ignored
 MOST_NODES = 20_000  # of a file
-HOUR = 3600.0  # s; the longest animation
-BLOCK = 256  # frames evaluated at once
 SAME = 1e-3  # of the size of the character: bind matrices that differ by less are the same
-
-
-Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +37,8 @@ class Piece:
     Attributes:
         vertices: (V, 3) in the space where they were bound. faces: (F, 3). owners, weights: (V, K), numbers into `nodes`, and
             how much each moves the vertex. nodes: (S,) of the file. inverse_binds: (S, 4, 4) from that space to each node.
-            bound: (4, 4) from that space to the world, None where the file does not say.
+            bound: (4, 4) from that space to the world, None where the file does not say. chosen: whether the triangles are
+            wanted, or only what they tell of the joints.
     """
 
     vertices: np.ndarray
@@ -60,6 +48,7 @@ class Piece:
     nodes: np.ndarray
     inverse_binds: np.ndarray
     bound: np.ndarray | None = None
+    chosen: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +58,7 @@ class Rig:
     Attributes:
         file: the path. nodes: (J,) the file's nodes that are the joints. names: their names. parents: (J,), -1 for the root.
             binds: (J, 4, 4) joint to world in the bind pose. used: (J,) whether a joint, or one below it, moves some vertex.
-            vertices: (V, 3). faces: (F, 3). weights: (V, J). A file without a skin has no vertices.
+            vertices: (V, 3). faces: (F, 3). weights: (V, J). A file without a skin has no vertices. notes: what was mended.
     """
 
     file: Path
@@ -81,51 +70,7 @@ class Rig:
     vertices: np.ndarray
     faces: np.ndarray
     weights: np.ndarray
-
-
-def split_clip(path: str | Path) -> tuple[str, str]:
-    """Return the file and the animation, or the ROOT, that `FILE.glb#NAME` names; the name is empty where none is given."""
-    found = re.match(r"(.+?\.(?:bvh|glb|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
-    return (found[1], found[2] or "") if found else (str(path), "")
-
-
-def clip_named(file: Path, names: Sequence[str], wanted: str) -> int:
-    """Return the number of the animation that has a name; the first where none is given.
-
-    Letters with accents are the same whether they are written as one character or as two.
-    """
-    names, wanted = [normalize("NFC", n) for n in names], normalize("NFC", wanted)
-    if not names:
-        raise InputError("an animation expected", file=file, field="animations", value="none", mend="export it with animation")
-    if wanted and wanted not in names:
-        raise InputError(
-            "no such animation", file=file, field="animations", value=wanted,
-            mend=f"write FILE#NAME with one of {', '.join(names)[:400]}",
-        )  # fmt: skip
-    return names.index(wanted) if wanted else 0
-
-
-def first_that_moves(
-    names: Sequence[str],
-    candidates: Sequence[int],
-    read: Callable[[int], Found],
-    moves: Callable[[Found], bool],
-    full: Sequence[int],
-) -> tuple[int, Found, tuple[str, ...]]:
-    """Return the number of the first animation among candidates that moves, what was read of it, and a note on the others.
-
-    Where none moves, the first. `full` are those that could be chosen by name; `read` gives something empty for the others.
-    """
-    found = {}
-    for number in candidates:
-        found[number] = read(number)
-        if moves(found[number]):
-            break
-    else:
-        number = candidates[0] if candidates else 0
-    others = ", ".join(names[n] for n in full if n != number)
-    note = (f"its animation {names[number]} is read; FILE#NAME reads another: {others[:400]}",) if others else ()
-    return number, found[number] if found else read(number), note
+    notes: tuple[str, ...] = ()
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -149,6 +94,7 @@ def rig_from(
     that the skin was bound (FBX); else the place of the root's node, with the turn of the armature or the quarter turn that is
     nearest to the mean turn of the joints.
 
+    Weights are divided by their sum; a vertex without follows the nearest that has some. See `_bound` for identity matrices.
     The root is the lowest node above all joints that move a vertex. A root bone of the file that moves no vertex, and below
     which the pelvis moves, is no joint, nor are controls beside it.
 
@@ -158,12 +104,12 @@ def rig_from(
 
     Raises:
         InputError: there is neither a piece nor a node that turns, the pieces hang on several skeletons or were bound in
-            several poses, weights do not sum to 1, or a matrix has no inverse.
+            several poses, or a matrix has no inverse.
     """
     if not pieces:
         return _rig_without_skin(file, names, parents, rest, turning)
-    for piece in pieces:
-        _check(file, names, piece)
+    notes: list[str] = []
+    pieces = [_bound(_weighted(_checked(file, names, p), parents, notes), rest, notes) for p in pieces]
     moving = {int(p.nodes[k]) for p in pieces for k in np.unique(p.owners[p.weights > 0])}
     root = lowest_common(parents, sorted(moving))
     if root < 0:
@@ -174,11 +120,14 @@ def rig_from(
     binds: dict[int, np.ndarray] = {}
     placed = []
     for piece in sorted(pieces, key=lambda p: -len(p.vertices)):
+        if not piece.chosen and all(n in binds or n not in number for n in piece.nodes.tolist()):
+            continue  # it tells nothing more
         to_world = _to_world(file, names, parents, rest, piece, binds)
         for node, inverse in zip(piece.nodes.tolist(), piece.inverse_binds, strict=True):
             if node in number:
                 binds.setdefault(node, to_world @ np.linalg.inv(inverse))
-        placed.append(_placed(piece, to_world, number))
+        if piece.chosen:
+            placed.append(_placed(piece, to_world, number))
     vertices, faces, weights = _joined(file, placed, len(joints))
     above = nearest_parents(parents, joints)
     used = np.array([n in moving for n in joints])
@@ -186,7 +135,7 @@ def rig_from(
         used[above[j]] |= used[j]
     return Rig(
         file, np.array(joints), unique_names([names[n] for n in joints]), above, _all_binds(joints, above, rest, binds), used,
-        vertices, faces, weights,
+        vertices, faces, weights, tuple(dict.fromkeys(notes)),
     )  # fmt: skip
 
 
@@ -203,16 +152,8 @@ def _rig_without_skin(file: Path, names: Sequence[str], parents: np.ndarray, res
     )  # fmt: skip
 
 
-def _check(file: Path, names: Sequence[str], piece: Piece) -> None:
-    """Raise an InputError unless weights sum to about 1 and inverse bind matrices can be inverted."""
-    sums = np.maximum(piece.weights, 0).sum(axis=1)
-    bad = ~(np.abs(sums - 1) < 0.1)
-    if bad.any():
-        v = int(bad.argmax())
-        raise InputError(
-            "weights that sum to 1 expected", file=file, field=f"skin, vertex {v} of the mesh", value=float(sums[v]),
-            mend="normalise the skinning weights, and give every vertex to some joint",
-        )  # fmt: skip
+def _checked(file: Path, names: Sequence[str], piece: Piece) -> Piece:
+    """Return a piece, after a check that its inverse bind matrices can be inverted."""
     with np.errstate(all="ignore"):
         flat = ~(np.abs(np.linalg.det(piece.inverse_binds[:, :3, :3])) > 1e-18)
     if flat.any():
@@ -220,6 +161,48 @@ def _check(file: Path, names: Sequence[str], piece: Piece) -> None:
             "matrices that can be inverted expected", file=file, value=piece.inverse_binds[flat.argmax()].tolist(),
             field=f"inverse bind matrix of {names[int(piece.nodes[flat.argmax()])]}", mend="export the file again",
         )  # fmt: skip
+    return piece
+
+
+def _weighted(piece: Piece, parents: np.ndarray, notes: list[str]) -> Piece:
+    """Return a piece whose rows of weights sum to 1; one without weights follows the nearest that has some, else the top."""
+    owners, weights = piece.owners, np.maximum(piece.weights, 0)
+    sums = weights.sum(axis=1, keepdims=True)
+    none = ~(sums[:, 0] > 1e-12)
+    off = float(sums[np.abs(sums - 1).argmax(), 0]) if len(sums) else 1.0
+    weights = weights / np.where(none[:, None], 1, sums)
+    if none.all():
+        top = min(range(len(piece.nodes)), key=lambda k: len(path_to_root(parents, int(piece.nodes[k]))))
+        owners, weights = np.full((len(owners), 1), top), np.ones((len(owners), 1))
+        notes.append("a mesh without skinning weights follows the first of its joints")
+    elif none.any():
+        from scipy.spatial import cKDTree
+
+        near = np.flatnonzero(~none)[cKDTree(piece.vertices[~none]).query(piece.vertices[none])[1]]
+        owners, weights = owners.copy(), weights.copy()
+        owners[none], weights[none] = owners[near], weights[near]
+        notes.append(f"{none.sum()} vertices without skinning weights follow the nearest that have some")
+    elif abs(off - 1) > 0.01:
+        notes.append(f"skinning weights that sum to {off:.4g} are divided by their sum")
+    return replace(piece, owners=owners, weights=weights)
+
+
+def _bound(piece: Piece, rest: np.ndarray, notes: list[str]) -> Piece:
+    """Return a piece bound as the nodes stand, where all its inverse bind matrices are the identity and these stand elsewhere.
+
+    Such a skin has no bind pose. The specification draws sum_j w_j M_j x, with M_j the node's matrix, and there it is bound.
+    """
+    worlds = rest[piece.nodes]
+    eye = np.abs(piece.inverse_binds - np.eye(4)).max() < 1e-6
+    if not eye or np.abs(worlds - worlds[:1]).max() < 1e-6 or (np.abs(np.linalg.det(worlds[:, :3, :3])) < 1e-18).any():
+        return piece
+    x = np.einsum("vk,vkab,vb->va", piece.weights, worlds[piece.owners, :3, :3], piece.vertices)
+    x += np.einsum("vk,vka->va", piece.weights, worlds[piece.owners, :3, 3])
+    edges = piece.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    drawn, own = (np.linalg.norm(y[edges[:, 0]] - y[edges[:, 1]], axis=1).sum() for y in (x, piece.vertices))
+    if drawn > 1.2 * own * np.cbrt(np.abs(np.linalg.det(worlds[:, :3, :3])).max()):
+        notes.append("the skin has no inverse bind matrices, and every viewer draws it torn apart: export it with them")
+    return replace(piece, vertices=x, inverse_binds=np.linalg.inv(worlds))
 
 
 def _to_world(
@@ -311,7 +294,7 @@ def _all_binds(joints: list[int], parents: np.ndarray, rest: np.ndarray, binds: 
     return np.array([found[j] for j in range(len(joints))])
 
 
-def _rest_rotations(rig: Rig) -> np.ndarray:
+def rest_rotations(rig: Rig) -> np.ndarray:
     """Return the rotation nearest to each bind matrix (J, 3, 3)."""
     left, _, right = np.linalg.svd(rig.binds[:, :3, :3])
     turns = left @ right
@@ -323,98 +306,6 @@ def body_of(rig: Rig) -> BodyRecord:
     if not len(rig.vertices):
         raise InputError("a skinned mesh expected", file=rig.file, field="skins", value="none", mend="export it with its skin")
     return BodyRecord(
-        rig.vertices, rig.faces, rig.binds[:, :3, 3].copy(), rig.parents, rig.weights, rig.names, _rest_rotations(rig)
-    )
-
-
-def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.ndarray], np.ndarray]) -> MotionRecord:
-    """Return the motion of joints that move as a file says: local rotations since rest, in the joints' own rest frames.
-
-    Since rest a joint has turned in the world by G_j = A_j B_j^-1, its matrix now times the inverse of its bind matrix. In its
-    own frame, seen from its parent, that is R_j = Q_j^T G_parent^T G_j Q_j, where Q_j is its rest rotation. A root above the
-    hips may stand still or carry a part of the path, and bones may slide a little about their mean, see `moving_root`.
-
-    Args:
-        rig: the joints. times: begin and end, s, and frames per second. worlds: gives, for times (n,) in s, the matrices
-            (n, J, 4, 4) joint to world.
-
-    Raises:
-        InputError: the motion lasts an hour or more, a joint scales by more than 1 %, or a joint leaves its mean place on its
-            parent by more than 1 cm and a twentieth of the bone. Joints that move no vertex may do both.
-    """
-    begin, end, fps = times
-    count = int(np.floor((end - begin) * fps + 1e-3)) + 1 if end - begin < HOUR else 0
-    if count < 1 or count * len(rig.names) * 24 > LARGEST:
-        raise InputError(
-            "an animation of less than an hour expected", file=rig.file, field="animations", value=f"{end - begin:.6g} s",
-            mend="cut it into several",
-        )  # fmt: skip
-    back, turned, placed = np.linalg.pinv(rig.binds), [], []
-    for first in range(0, count, BLOCK):
-        at = worlds(begin + np.arange(first, min(first + BLOCK, count)) / fps)
-        turned.append(_rotations(rig, (at @ back)[..., :3, :3], first))
-        placed.append(at[..., :3, 3])
-    world, place = np.concatenate(turned), np.concatenate(placed)
-    joints, kept, notes = _settled(rig, world, place)
-    rest, parents = _rest_rotations(rig)[kept], nearest_parents(rig.parents, kept)
-    local = world[:, kept]
-    local[:, 1:] = np.swapaxes(local[:, parents[1:]], -1, -2) @ local[:, 1:]
-    own = np.swapaxes(rest, -1, -2) @ local @ rest
-    poses = Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(own.shape[:3])
-    names = tuple(rig.names[j] for j in kept)
-    return MotionRecord(poses, place[:, kept[0]] - joints[0], fps, names, joints, parents, rest_rotations=rest, notes=notes)
-
-
-def _settled(rig: Rig, world: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, list[int], tuple[str, ...]]:
-    """Return rest joints whose bones are as long as they are on average, the numbers of the joints that are kept, and notes.
-
-    A bone keeps its place in the bind pose where it is within `GIVE` of it.
-    """
-    joints, parents = rig.binds[:, :3, 3].copy(), rig.parents
-    seen = np.einsum("tjba,tjb->tja", world[:, parents[1:]], place[:, 1:] - place[:, parents[1:]])
-    if not np.isfinite(place).all():
-        t, j = (int(i) for i in np.argwhere(~np.isfinite(place).all(axis=-1))[0])
-        where = f"animation, frame {t}, joint {rig.names[j]}"
-        raise InputError("finite numbers expected", file=rig.file, field=where, mend="export it again")
-    bones, bind = seen.mean(axis=0), joints[1:] - joints[parents[1:]]
-    off = np.concatenate([[0.0], np.linalg.norm(seen - bones, axis=-1).max(axis=0)])
-    length = np.concatenate([[0.0], np.linalg.norm(bones, axis=-1)])
-    wrong = rig.used & (off > np.maximum(GIVE, SLIDE * length))
-    own = np.asarray(rig.weights.any(axis=0))
-    if not len(rig.weights):
-        own = (np.abs(world - world[:1]) > 0.01).any(axis=(0, 2, 3)) & ~wrong
-    kept = moving_root(parents, wrong, own, 0 if len(rig.weights) else SPARE)
-    others = kept[1:]
-    slides = np.where(rig.used & (off > GIVE), off, 0)
-    notes = check_slides(rig.file, [rig.names[j] for j in others], slides[others], length[others], wrong[others])
-    near = np.linalg.norm(bones - bind, axis=-1) <= GIVE
-    changed = [j for j in others if rig.used[j] and not near[j - 1]]
-    for j in others:
-        joints[j] = joints[parents[j]] + (bones[j - 1] if j in changed else bind[j - 1])
-    if changed:
-        notes = (*notes, f"{len(changed)} bones are longer or shorter than in the bind pose, as {rig.names[changed[0]]}")
-    if kept[0]:
-        gone = ", ".join(n for j, n in enumerate(rig.names) if j not in kept)
-        notes = (f"{rig.names[kept[0]]} carries the path, so it is the root; left out: {gone[:200]}", *notes)
-    return joints[kept], kept, notes
-
-
-def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
-    """Return the rotations in matrices (T, J, 3, 3).
-
-    The matrix of a used joint must be one but for rounding. For other joints what is none becomes the identity.
-    """
-    with np.errstate(all="ignore"):
-        scale = np.cbrt(np.linalg.det(linear))
-        turns = linear / scale[..., None, None]
-        square = np.swapaxes(turns, -1, -2) @ turns
-        bad = ~((np.abs(scale - 1) < GIVE) & (np.abs(square - np.eye(3)).max(axis=(-1, -2)) < 2 * GIVE))
-        for _ in range(3):  # to the nearest rotation (Higham 1986, Newton-Schulz)
-            turns = turns @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(turns, -1, -2) @ turns)
-    if (bad & rig.used).any():
-        t, j = (int(i) for i in np.argwhere(bad & rig.used)[0])
-        raise InputError(
-            "rotations without scale expected", file=rig.file, field=f"animation, frame {t + first}, joint {rig.names[j]}",
-            value=f"scaled by {float(scale[t, j]):.4g}, or sheared", mend="apply scale, and animate rotations only",
-        )  # fmt: skip
-    return np.where(bad[..., None, None], np.eye(3), turns)
+        rig.vertices, rig.faces, rig.binds[:, :3, 3].copy(), rig.parents, rig.weights, rig.names, rest_rotations(rig),
+        notes=rig.notes,
+    )  # fmt: skip

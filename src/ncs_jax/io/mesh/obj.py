@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes, one_object
 from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import text_of
 
 __all__ = ["format_obj", "read_obj"]
 
 
-def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Read an .obj: the file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2).
+def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
+    """Read an .obj: vertices, triangles and texture coordinates.
 
-    Polygons are cut as `triangulate` says. Negative numbers count back from the last vertex. Objects, groups, materials,
-    normals, lines and points are ignored. Texture coordinates are None where a vertex has none, or two that differ.
+    Polygons are cut as `triangulate` says. Negative numbers count back from the last vertex. Normals, lines and points are
+    ignored. Texture coordinates are None where a vertex has none, or two that differ.
+
+    Args:
+        path: the file. mesh: names of objects (`o`), groups (`g`) or materials (`usemtl`) to read, with their vertices alone.
+            None: the file must hold one object; its groups and materials are joined.
     """
     file, text = text_of(path)
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = []
     counts: list[int] = []
     corners: list[tuple[int, int]] = []  # (vertex, texture coordinate)
+    names = {"o": "", "g": "", "usemtl": ""}
+    labels: list[tuple[str, str, str]] = []  # of each polygon
     for line, words in _lines(text):
         if words[0] == "v":
             vertices.append(_numbers(file, line, words, 3))
@@ -35,9 +44,35 @@ def read_obj(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray
                 raise InputError("three corners or more expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
             counts.append(len(polygon))
             corners.extend(polygon)
-    x = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    cut = triangulate(file, x, np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2)[:, 0])
-    return file, x, cut, _per_vertex(len(x), coordinates, corners)
+            labels.append((names["o"], names["g"], names["usemtl"]))
+        elif words[0] in names:
+            names[words[0]] = " ".join(words[1:])
+    x, count = np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(counts, np.int64)
+    corner = np.array(corners, np.int64).reshape(-1, 2)
+    chosen = _chosen(file, mesh, labels, np.repeat(np.arange(len(count)), count), corner[:, 0])
+    if not chosen.all():
+        corner, count = corner[np.repeat(chosen, count)], count[chosen]
+        used, corner[:, 0] = np.unique(corner[:, 0], return_inverse=True)
+        x = x[used]
+    cut = triangulate(file, x, count, corner[:, 0])
+    return RawGarment(file, x, cut, _per_vertex(len(x), coordinates, corner))
+
+
+def _chosen(file: Path, mesh: Sequence[str], labels: list, owner: np.ndarray, corner: np.ndarray) -> np.ndarray:
+    """Return which polygons (P,) are meant by the names of objects, groups or materials; owner: of each corner, its polygon."""
+    different = list(dict.fromkeys(labels))
+    objects = list(dict.fromkeys(o or g for o, g, _ in different))
+    place = {label: i for i, label in enumerate(different)}
+    number = np.array([place[label] for label in labels], np.int64)
+    of_corner = number[owner]
+    named = []
+    for i, (o, g, material) in enumerate(different):
+        others = tuple(dict.fromkeys(([g] if o and g else []) + g.split()))  # several groups may stand in one line
+        named.append(NamedMesh(o or g, objects.index(o or g), len(np.unique(corner[of_corner == i])), others, material))
+    chosen = chosen_meshes(file, "garment.mesh", mesh, named)
+    if not mesh:
+        one_object(file, "garment.mesh", [n for n, (o, _, _) in zip(named, different, strict=True) if o])
+    return chosen[number] if len(number) else np.ones(0, bool)
 
 
 def _lines(text: str):
@@ -92,13 +127,12 @@ def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -
     return v, t
 
 
-def _per_vertex(count: int, coordinates: list[list[float]], corners: list[tuple[int, int]]) -> np.ndarray | None:
-    if not coordinates or not corners:
+def _per_vertex(count: int, coordinates: list[list[float]], corners: np.ndarray) -> np.ndarray | None:
+    """Return texture coordinates (V, 2) of corners (vertex, coordinate), None where a vertex has none or two that differ."""
+    v, t = corners.T
+    if not coordinates or not len(v) or (t < 0).any() or len(np.unique(v)) != count:
         return None
     table = np.array(coordinates, dtype=np.float64)
-    v, t = np.array(corners).T
-    if (t < 0).any() or len(np.unique(v)) != count:
-        return None
     uv = np.empty((count, 2))
     uv[v] = table[t]
     return uv if np.array_equal(uv[v], table[t], equal_nan=True) else None

@@ -9,6 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import LARGEST, readable, reading
 from ncs_jax.io.tables.table import indices
 
@@ -29,8 +30,8 @@ class _Element:
     properties: list[tuple[str, str, str]] = field(default_factory=list)  # name, type, and type of a list's length or ""
 
 
-def read_ply(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Read a .ply: the file, vertices (V, 3), faces (F, 3) int32 and texture coordinates (V, 2) or None.
+def read_ply(path: str | Path) -> RawGarment:
+    """Read a .ply: vertices, triangles and texture coordinates.
 
     Polygons are cut as `triangulate` says. Edges and whatever else the file holds are ignored.
     """
@@ -54,12 +55,12 @@ def read_ply(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray
         uv = None if pair is None else np.stack([points[n].astype(np.float64) for n in pair], axis=1)
         name = next((n for n in POLYGONS if n in polygons), None)
         if name is None:
-            return file, x, np.zeros((0, 3), np.int32), uv
+            return RawGarment(file, x, np.zeros((0, 3), np.int32), uv)
         corners = polygons[name]
         if corners.dtype.kind == "f" and (np.abs(corners) < 2**31).all() and (corners == np.floor(corners)).all():
             corners = corners.astype(np.int64)  # a text file does not say that they are whole numbers
         corners = indices(file, f"face.{name}", corners, ("N",), len(x), "vertices")
-        return file, x, triangulate(file, x, lengths["face"], corners), uv
+        return RawGarment(file, x, triangulate(file, x, lengths["face"], corners), uv)
 
 
 def _header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:

@@ -11,19 +11,25 @@ from ncs_jax.errors import InputError
 
 __all__ = ["triangulate"]
 
+FOLDED = 0.1  # of the area of a polygon that crosses itself may be folded; more is refused
+SLIVER = 0.03  # of its length squared too, for what is so slim that its area says little
+
 
 def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarray, skip: Collection[int] = ()) -> np.ndarray:
     """Cut polygons into triangles (F, 3) int32, in their order and each facing as its polygon does.
 
     A polygon is cut by a fan from its first corner, if every triangle of the fan faces as the polygon's normal (Newell's); else
-    by one from its second corner; else ear by ear, seen along the normal. A polygon of no area is cut by a fan.
+    by one from its second corner; else ear by ear, seen along the normal. A polygon of no area is cut by a fan. Corners that
+    repeat the one before are left out, and with them a polygon of fewer than three. One that crosses itself a little, as
+    where two corners almost coincide, is cut so that the least area is folded.
 
     Args:
         file: what an error names. x: (V, 3) vertices. counts: (P,) corners of each polygon. corners: (sum of counts,) vertices
             from 0 to V - 1, polygon after polygon. skip: polygons to leave out.
 
     Raises:
-        InputError: a polygon has fewer than three corners, counts and corners do not fit, or a polygon crosses itself.
+        InputError: a polygon has fewer than three corners, counts and corners do not fit, or a polygon crosses itself so that
+            more than `FOLDED` of its area, or `SLIVER` of its length squared, would be folded.
     """
     counts = np.asarray(counts).reshape(-1)
     if counts.dtype.kind not in "iu" or (counts < 3).any() or counts.sum(dtype=np.float64) != len(corners):
@@ -34,16 +40,30 @@ def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarr
             value=f"{counts[few[0]]} corners" if len(few) else f"{counts.sum(dtype=np.float64):.0f} corners",
             mend="delete such faces, or export the mesh again",
         )  # fmt: skip
-    starts = np.cumsum(counts, dtype=np.int64) - counts
     kept = np.ones(len(counts), bool)
     kept[[i for i in skip if 0 <= i < len(counts)]] = False
+    counts, corners = _without_repeats(counts, np.asarray(corners))
+    kept &= counts > 2
+    starts = np.cumsum(counts, dtype=np.int64) - counts
     first = np.cumsum(np.where(kept, counts - 2, 0), dtype=np.int64) - np.where(kept, counts - 2, 0)
     triangles = np.empty((int(np.where(kept, counts - 2, 0).sum()), 3), np.int32)
     for n in np.unique(counts[kept]):
         number = np.flatnonzero(kept & (counts == n))
-        polygons = np.asarray(corners)[starts[number, None] + np.arange(n)]
+        polygons = corners[starts[number, None] + np.arange(n)]
         triangles[first[number, None] + np.arange(n - 2)] = _equal(file, x, polygons, number)
     return triangles
+
+
+def _without_repeats(counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return polygons of four corners or more without the corners that repeat the one before; the first follows the last."""
+    stops = np.cumsum(counts, dtype=np.int64)
+    before = np.roll(corners, 1)
+    before[stops - counts] = corners[stops - 1]
+    same = (before == corners) & np.repeat(counts > 3, counts)
+    if not same.any():
+        return counts, corners
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return counts - np.bincount(owner[same], minlength=len(counts)), corners[~same]
 
 
 def _equal(file: Path, x: np.ndarray, polygons: np.ndarray, number: np.ndarray) -> np.ndarray:
@@ -80,6 +100,8 @@ def _ears(file: Path, x: np.ndarray, unit: np.ndarray, number: int) -> np.ndarra
     flat = np.stack([x @ u, x @ np.cross(unit, u)], axis=1)
     left, cut = list(range(len(x))), []
     least = 1e-9 * np.abs(x).max() ** 2
+    whole, lost = abs(float(_cross(flat, np.roll(flat, -1, axis=0)).sum())), 0.0  # twice the areas: whole, and folded
+    most = max(FOLDED * whole, SLIVER * float((np.ptp(flat, axis=0) ** 2).sum()))
     while len(left) > 2:
         a, b, c = (flat[np.roll(left, k)] for k in (1, 0, -1))
         area = _cross(b - a, c - b)
@@ -89,9 +111,13 @@ def _ears(file: Path, x: np.ndarray, unit: np.ndarray, number: int) -> np.ndarra
             for k in np.argsort(-fat, kind="stable").tolist()
             if area[k] > least and not _holds(a[k], b[k], c[k], flat[[v for v in left if v not in _around(left, k)]])
         )
-        line = area.max() <= least and area.min() >= -least  # what is left has no area
-        ear = int(area.argmax()) if line else next(ears, None)
+        line = np.abs(area) <= least  # a corner where the outline goes straight on, or turns back: a spike, which is cut first
+        spikes = np.flatnonzero(line & (np.sum((b - a) * (c - b), axis=1) <= 0))
+        ear = int(spikes[0]) if len(spikes) else int(area.argmax()) if line.all() else next(ears, None)
         if ear is None:
+            ear, folded = _least_folded(flat, left)
+            lost += folded
+        if lost > most:
             raise InputError(
                 "a polygon that does not cross itself expected", file=file, field=f"faces, face {number}",
                 value=f"{len(x)} corners", mend="triangulate it where the mesh was made",
@@ -99,6 +125,22 @@ def _ears(file: Path, x: np.ndarray, unit: np.ndarray, number: int) -> np.ndarra
         cut.append(_around(left, ear))
         del left[ear]
     return np.array(cut)
+
+
+def _least_folded(flat: np.ndarray, left: list[int]) -> tuple[int, float]:
+    """Return the corner to cut where none is an ear, the one that folds the least, and twice the area that it folds.
+
+    Cutting a corner folds its triangle where that faces the other way; the other corners in the triangle fold what they span.
+    """
+    costs = []
+    for k in range(len(left)):
+        a, b, c = flat[_around(left, k)]
+        rest = [v for i, v in enumerate(left) if i != k]
+        after = flat[rest]
+        own, others = float(_cross(b - a, c - b)), float(_cross(after, np.roll(after, -1, axis=0)).sum())
+        costs.append(max(-own, 0.0) + max(-others, 0.0))
+    best = int(np.argmin(costs))
+    return best, costs[best]
 
 
 def _around(left: list[int], k: int) -> list[int]:

@@ -6,9 +6,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,37 +17,38 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh import usd_arrays
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes, one_object
 from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import LARGEST, readable, reading, replacing
 from ncs_jax.io.tables.table import floats, indices
 
-__all__ = ["USD", "UsdMesh", "read_usd_animation", "read_usd_mesh", "write_usd"]
+__all__ = ["USD", "read_usd_animation", "read_usd_mesh", "write_usd"]
 
 USD = (".usd", ".usdc", ".usda", ".usdz")
-
-
-@dataclass(frozen=True, eq=False)
-class UsdMesh:
-    """Vertices (V, 3) in the stage's world, triangles (F, 3), metres a unit, and the axis that is up, "x", "y" or "z"."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    scale: float
-    up: str
 
 
 # --- in ---------------------------------------------------------------------------------------------------------------------
 
 
-def read_usd_mesh(path: str | Path) -> tuple[Path, UsdMesh]:
-    """Read all meshes of a file as one, at rest (the default time), or at the first time sample where there are only samples.
+def read_usd_mesh(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
+    """Read a mesh at rest (the default time), or at the first time sample where there are only samples.
 
     Transforms are applied and polygons become triangles. The cage of a subdivision surface is not subdivided. Vertices keep the
     file's order, mesh after mesh.
+
+    Args:
+        path: the file. mesh: paths of prims, or names in these, whose meshes are joined. None: the file must hold one mesh.
     """
     file, table = _arrays(path, "still")
-    x, faces = _joined(file, table)
-    return file, UsdMesh(x[0], faces, float(table["scale"]), str(table["up"]))
+    names = [str(table[f"{i}.name"]) for i in range(sum(key.endswith(".points") for key in table))]
+    sizes = [table[f"{i}.points"].shape[1] for i in range(len(names))]
+    named = [NamedMesh(n, i, sizes[i], tuple(n.split("/")[1:])) for i, n in enumerate(names)]
+    chosen = chosen_meshes(file, "garment.mesh", mesh, named)
+    if not mesh:
+        one_object(file, "garment.mesh", named)
+    x, faces = _joined(file, table, np.flatnonzero(chosen).tolist())
+    return RawGarment(file, x[0], faces, unit=float(table["scale"]), up=str(table["up"]))
 
 
 def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, float]:
@@ -60,7 +60,7 @@ def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, 
             "points with time samples in even steps expected", file=file, field="points", value=table["times"][:4].tolist(),
             mend="export the animation with a sample in every frame",
         )  # fmt: skip
-    x, faces = _joined(file, table)
+    x, faces = _joined(file, table, range(sum(key.endswith(".points") for key in table)))
     rate = float(table["rate"]) / (steps[0] if len(steps) else 1.0)
     return file, upright(x, float(table["scale"]), str(table["up"])), faces, rate
 
@@ -93,10 +93,10 @@ def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
     return file, found
 
 
-def _joined(file: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (T, V, 3) in the world and triangles (F, 3) of all meshes."""
+def _joined(file: Path, table: dict[str, np.ndarray], meshes: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (T, V, 3) in the world and triangles (F, 3) of some meshes."""
     parts, faces, start = [], [], 0
-    for i in range(sum(key.endswith(".points") for key in table)):
+    for i in meshes:
         name, turn = str(table[f"{i}.name"]), table[f"{i}.turn"]
         x = floats(file, f"{name}.points", table[f"{i}.points"], ("T", "V", 3), ("frame", "vertex"))
         if not np.array_equal(turn, np.broadcast_to(np.eye(4), turn.shape)):

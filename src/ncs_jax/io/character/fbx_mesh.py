@@ -1,0 +1,138 @@
+"""Meshes in FBX: polygons under models, with blend shapes and skins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ncs_jax.io.character.fbx import Record
+from ncs_jax.io.character.fbx_graph import Graph, euler, name_of, properties_of
+from ncs_jax.io.character.rig import Piece
+from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes
+from ncs_jax.io.mesh.polygons import triangulate
+
+__all__ = ["FbxMesh", "fbx_meshes", "fbx_pieces", "fbx_triangles"]
+
+
+@dataclass(frozen=True, eq=False)
+class FbxMesh:
+    """A mesh under a model: the model's number, the mesh's key and record, the key of its skin or None, and its names."""
+
+    model: int
+    key: int
+    record: Record
+    skin: int | None
+    named: NamedMesh
+
+
+def fbx_meshes(graph: Graph) -> list[FbxMesh]:
+    """Return every mesh under a model, with the first skin that deforms it."""
+    found = []
+    for number, model in enumerate(graph.models):
+        for key, mesh, _ in graph.under(model.key, "Geometry", "Mesh"):
+            skin = next((k for k, _, _ in graph.under(key, "Deformer", "Skin")), None)
+            materials = [name_of(r) for _, r, _ in graph.under(model.key, "Material")]
+            count = graph.fbx.array(mesh, "Vertices", f"mesh of {model.name}").size // 3
+            others = tuple(n for n in (name_of(mesh), *(materials if len(materials) == 1 else ())) if n)
+            found.append(FbxMesh(number, key, mesh, skin, NamedMesh(model.name, number, count, others)))
+    return found
+
+
+def fbx_pieces(
+    graph: Graph,
+    part: Sequence[str] = (),
+    shapes: Mapping[str, float] | None = None,
+    worn: Sequence[FbxMesh] = (),
+) -> list[Piece]:
+    """Return the triangles under each skin, chosen by `part` or `worn`; the others are there too: they tell of the joints."""
+    drawn = [d for d in fbx_meshes(graph) if d.skin is not None]
+    chosen = chosen_meshes(graph.fbx.file, "body.part", part, [d.named for d in drawn])
+    if worn:
+        chosen = np.isin([d.key for d in drawn], [d.key for d in worn])
+    known = dict.fromkeys(n for d, c in zip(drawn, chosen, strict=True) if c for n in _blend_shapes(graph, d))
+    for name in shapes or {}:
+        if name not in known:
+            raise graph.fbx.wrong("no such shape", "body.shapes", name, f"the file has {', '.join(known)[:600] or 'none'}")
+    return [replace(_piece(graph, d, shapes or {}), chosen=c) for d, c in zip(drawn, chosen.tolist(), strict=True)]
+
+
+def _blend_shapes(graph: Graph, mesh: FbxMesh) -> dict[str, tuple[float, Record]]:
+    """Return the blend shapes of a mesh by name: the share that the file gives each, and its offsets.
+
+    Of a channel with shapes in between, the last is taken: the one of full weight.
+    """
+    found = {}
+    for deformer, _, _ in graph.under(mesh.key, "Deformer", "BlendShape"):
+        for key, channel, _ in graph.under(deformer, "Deformer", "BlendShapeChannel"):
+            given = properties_of(channel).get("DeformPercent") or [channel.first("DeformPercent").value(0, (int, float), 0.0)]
+            shapes = [record for _, record, _ in graph.under(key, "Geometry", "Shape")]
+            if shapes:
+                found[name_of(channel)] = (float(given[0]) / 100, shapes[-1])
+    return found
+
+
+def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3), moved by blend shapes, and triangles (F, 3) of a mesh, in its model's space."""
+    fbx, model = graph.fbx, graph.models[mesh.model]
+    where = f"mesh of {model.name}"
+    x = fbx.array(mesh.record, "Vertices", where)
+    corners = fbx.array(mesh.record, "PolygonVertexIndex", where, whole=True)
+    if not len(x) or len(x) % 3 or not len(corners):
+        raise fbx.wrong("vertices and polygons expected", where, f"{len(x)} numbers, {len(corners)} corners")
+    x = x.reshape(-1, 3)
+    last = corners < 0
+    corners = np.where(last, -1 - corners, corners)
+    if corners.max() >= len(x) or not last[-1]:
+        raise fbx.wrong(f"whole polygons of the {len(x)} vertices expected", where, int(corners.max()))
+    for name, (usual, shape) in _blend_shapes(graph, mesh).items():
+        if weight := shapes.get(name, usual):
+            at, moved = fbx.array(shape, "Indexes", where, whole=True), fbx.array(shape, "Vertices", where).reshape(-1, 3)
+            if len(at) != len(moved) or (len(at) and not 0 <= at.min() <= at.max() < len(x)):
+                raise fbx.wrong(f"offsets of some of the {len(x)} vertices expected", f"{where}, shape {name}", len(at))
+            x = x.copy()
+            np.add.at(x, at, weight * moved)
+    scale = model.vector("GeometricScaling", 1.0)
+    x = (x * scale) @ euler(model.vector("GeometricRotation")).T + model.vector("GeometricTranslation")
+    counts = np.diff(np.flatnonzero(last), prepend=-1)
+    area = np.repeat(counts > 2, counts)  # edges that stand by themselves are polygons of two corners
+    faces = triangulate(fbx.file, x, counts[counts > 2], corners[area])
+    return x, faces if scale.prod() > 0 else faces[:, ::-1]
+
+
+def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
+    """Return the triangles of one mesh with the joints and weights of its skin."""
+    fbx, model = graph.fbx, graph.models[mesh.model]
+    where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
+    x, faces = fbx_triangles(graph, mesh, shapes)
+    rows: list[tuple[np.ndarray, np.ndarray]] = []
+    nodes, binds, bounds = [], [], []
+    for key, cluster, _ in graph.under(mesh.skin or 0, "Deformer", "Cluster"):
+        bones = [place[k] for k, _, _ in graph.under(key, "Model")]
+        own = fbx.array(cluster, "Indexes", where, whole=True), fbx.array(cluster, "Weights", where)
+        to_bone, to_world = fbx.array(cluster, "Transform", where), fbx.array(cluster, "TransformLink", where)
+        if (
+            len(bones) != 1
+            or not len(to_bone) == len(to_world) == 16
+            or len(own[0]) != len(own[1])
+            or (own[0].size and own[0].max() >= len(x))
+        ):
+            raise fbx.wrong("a joint, its place, and weights of vertices that are there expected", where, name_of(cluster))
+        rows.append(own)
+        nodes.append(bones[0])
+        binds.append(to_bone.reshape(4, 4).T)
+        bounds.append(graph.to_metres @ to_world.reshape(4, 4).T @ binds[-1])
+    if not nodes or min((r[0].min() for r in rows if r[0].size), default=-1) < 0:
+        raise fbx.wrong("vertices that joints move expected", where, f"{len(nodes)} joints")
+    vertex, weight = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+    owner = np.repeat(np.arange(len(rows)), [len(r[0]) for r in rows])
+    order = np.argsort(vertex, kind="stable")
+    vertex, weight, owner = vertex[order], weight[order], owner[order]
+    slot = np.arange(len(vertex)) - np.searchsorted(vertex, vertex)
+    owners = np.zeros((len(x), int(slot.max()) + 1), np.int64)
+    weights = np.zeros(owners.shape)
+    owners[vertex, slot], weights[vertex, slot] = owner, np.maximum(weight, 0)
+    sums = weights.sum(axis=1, keepdims=True)
+    weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
+    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])
