@@ -12,9 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.geometry.mesh import topology
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
-from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, to_rest_axes, transforms
+from ncs_jax.geometry.skinning import (
+    Skeleton,
+    blend,
+    blend_from,
+    corrected,
+    correctives_from,
+    forward,
+    skin,
+    to_rest_axes,
+    transforms,
+)
+from ncs_jax.io.records import BodyRecord
+from ncs_jax.prepare.posing import corrected_rest
 from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import Skinned, touchable
+from ncs_jax.prepare.touchable import touchable
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene
@@ -153,7 +165,6 @@ def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
     cloth = cloth + [-0.04, 0.2, 0.11]
     cloth_weights = np.tile([1.0, 0.0], (len(cloth), 1))
     joints, parents = body["joints"], [-1, 0]
-    skeleton = Skeleton(jnp.asarray(joints), (-1, 0))
     bent = [np.stack([rotation([1, 2, 3], 0.7), rotation([1, 0, 0], a)]) for a in (2.9, 1.2)]
 
     right = np.zeros(len(body["vertices"]), bool)
@@ -165,16 +176,28 @@ def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
         assert np.abs(distance - reach).min() > 1e-9  # no tie
         by_pose.append(distance <= reach)
         right |= distance <= reach
-    blends = blend_from(cloth_weights, dtype=jnp.float64), blend_from(body["blend_weights"], dtype=jnp.float64)
-    found = touchable(skeleton, Skinned(cloth, blends[0]), Skinned(body["vertices"], blends[1]), bent, reach)
+    record = BodyRecord(body["vertices"], body["faces"], joints, np.array(parents, np.int32), body["blend_weights"])
+    blend, poses = blend_from(cloth_weights, dtype=jnp.float64), Rotation.from_matrix(np.reshape(bent, (4, 3, 3))).as_rotvec()
+    found = touchable(record, cloth, blend, poses.reshape(2, 2, 3), reach)
     np.testing.assert_array_equal(found, right)
     assert not found.all()
     if reach > 0.03:
         assert by_pose[0].any()
     if reach > 0.05:
         assert (by_pose[1] & ~by_pose[0] & ~by_pose[2]).any()  # the folded arm is what the poses are looked at for
-    at_rest = touchable(skeleton, Skinned(cloth, blends[0]), Skinned(body["vertices"], blends[1]), [], reach)
+    at_rest = touchable(record, cloth, blend, np.zeros((0, 2, 3)), reach)
     np.testing.assert_array_equal(at_rest, by_pose[0])
+
+
+def test_the_host_corrects_a_pose_as_the_model_does(rng):
+    parents = [-1, 0, 1]
+    skeleton = Skeleton(jnp.asarray(rng.normal(size=(3, 3))), tuple(parents))
+    local = Rotation.from_rotvec(rng.normal(size=(3, 3))).as_matrix()
+    m = transforms(skeleton, forward(skeleton, jnp.asarray(local), jnp.zeros(3)))
+    x, more = rng.normal(size=(5, 3)), correctives_from(rng.normal(size=(5, 3, 18)), dtype=jnp.float64)
+    expected = corrected(jnp.asarray(x), more, m, parents)
+    np.testing.assert_allclose(corrected_rest(x, more, np.asarray(m), parents), expected, atol=1e-12)
+    assert np.abs(expected - x).max() > 0.1
 
 
 def test_the_body_that_can_be_touched_is_posed_like_the_whole(tmp_path, rng):

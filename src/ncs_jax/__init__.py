@@ -1,19 +1,25 @@
 """Neural cloth simulation in JAX: a garment learns to move on an animated character from the physics energy alone."""
 
-from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
-from ncs_jax.energies.total import energies, total
-from ncs_jax.errors import InputError
-from ncs_jax.metrics.quality import measure, summarise
-from ncs_jax.network.rollout import animate, stepper
-from ncs_jax.prepare.build import Assembly
-from ncs_jax.runs.log import Report
-from ncs_jax.runs.run import Run, assemble, load_run
-from ncs_jax.runs.simulate import Trajectory, simulate
-from ncs_jax.runs.train import train
-from ncs_jax.scene.model import Model, local_rotations
-from ncs_jax.scene.spec import Scene, load_scene, scene_from
+import importlib
+import sys
+import types
+from typing import TYPE_CHECKING
 
-Frame = StepInputs  # its name until version 0.1
+if TYPE_CHECKING:
+    from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
+    from ncs_jax.energies.total import energies, total
+    from ncs_jax.errors import InputError
+    from ncs_jax.metrics.quality import measure, summarise
+    from ncs_jax.network.rollout import animate, stepper
+    from ncs_jax.prepare.build import Assembly
+    from ncs_jax.runs.log import Report
+    from ncs_jax.runs.run import Run, assemble, load_run
+    from ncs_jax.runs.simulate import Trajectory, simulate
+    from ncs_jax.runs.train import train
+    from ncs_jax.scene.model import Model, local_rotations
+    from ncs_jax.scene.spec import Scene, load_scene, scene_from
+
+    Frame = StepInputs
 
 __all__ = [
     "Assembly",
@@ -42,3 +48,46 @@ __all__ = [
     "total",
     "train",
 ]
+
+# The same names by the module that each is imported from when it is first read: JAX alone takes a second to import.
+_HOMES = {
+    "energies.terms": ("Garment", "Material", "StepInputs", "Terms"),
+    "energies.total": ("energies", "total"),
+    "errors": ("InputError",),
+    "metrics.quality": ("measure", "summarise"),
+    "network.rollout": ("animate", "stepper"),
+    "prepare.build": ("Assembly",),
+    "runs.log": ("Report",),
+    "runs.run": ("Run", "assemble", "load_run"),
+    "runs.simulate": ("Trajectory", "simulate"),
+    "runs.train": ("train",),
+    "scene.model": ("Model", "local_rotations"),
+    "scene.spec": ("Scene", "load_scene", "scene_from"),
+}
+_HOME = {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
+_OLD = {"Frame": "StepInputs"}  # names until version 0.1
+
+
+class _Face(types.ModuleType):
+    """The package itself, whose names are imported when they are first read."""
+
+    def __getattr__(self, name: str):
+        name = _OLD.get(name, name)
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_HOME[name]), name)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *__all__})
+
+    @property
+    def energies(self):
+        """Return the function, and not the package of that name, which any import from it would leave here."""
+        return self.__getattr__("energies")
+
+    @energies.setter
+    def energies(self, package) -> None:
+        pass
+
+
+sys.modules[__name__].__class__ = _Face

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
-from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.spec import load_scene, template
 
 if TYPE_CHECKING:
     from ncs_jax.io import MotionRecord
-    from ncs_jax.prepare.build import Assembly
+    from ncs_jax.prepare.setting import Setting
 
 __all__ = ["add_commands", "check"]
 
@@ -32,27 +32,33 @@ def add_commands(commands) -> None:
 
 def check(options) -> int:
     """Print what puts a scene at risk and what is in it, and draw its motions."""
-    from ncs_jax.prepare.scene_checks import find_risks
-    from ncs_jax.runs.run import assemble
-    from ncs_jax.scene.spec import template
-
     if options.fields:
         print(template(), end="")
         return 0
     if options.scene is None:
         raise InputError("a scene file is needed", mend="give one, ncs:tshirt for the packaged one, or --fields")
-    assembly = assemble(load_scene(options.scene), report=_say)
+    scene = load_scene(options.scene)  # before JAX is imported, which takes a second
+
+    from ncs_jax.prepare.scene_checks import find_risks
+    from ncs_jax.prepare.setting import set_up
+
+    below = []
+    if scene.garment.over:
+        from ncs_jax.runs.run import worn_below
+
+        below = worn_below(scene)
+    setting = set_up(scene, below=below, report=_say)
     _say("looking for risks")
-    risks = find_risks(assembly)
-    groups = _alike(assembly.motions)
-    drawn = _draw(options.out, assembly, groups)
+    risks = find_risks(setting)
+    groups = _alike(setting.motions)
+    drawn = _draw(options.out, setting, groups)
     print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
     for risk in risks:
         _tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
     if not risks:
         _tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
-    _tell_scene(assembly)
-    _tell_motions(assembly, groups)
+    _tell_scene(setting)
+    _tell_motions(setting, groups)
     if drawn:
         _tell("picture", drawn)
     return 0
@@ -67,37 +73,37 @@ def _tell(label: str, text: str) -> None:
     print(textwrap.fill(text, 128, initial_indent=f"  {label:10}", subsequent_indent=14 * " ", break_on_hyphens=False))
 
 
-def _tell_scene(assembly: Assembly) -> None:
+def _tell_scene(setting: Setting) -> None:
     """Print what the garment, the body and the physics are."""
     from ncs_jax.energies.terms import NAMES
     from ncs_jax.prepare.garment_checks import summarise_surface
     from ncs_jax.prepare.joint_names import listed
 
-    model, mesh = assembly.model, assembly.model.garment.mesh
-    names = assembly.body.joint_names if assembly.body is not None else ()
+    model, mesh = setting.model, setting.model.garment.mesh
+    names = setting.body.joint_names if setting.body is not None else ()
     joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
     terms = model.terms
     on = [name for name in NAMES if getattr(terms, name, None)] + [term.__name__ for term in terms.own]
     mass = float((mesh.vertex_area * model.material.density).sum())
     size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
     _tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
-    record = assembly.garment
+    record = setting.garment
     parts = summarise_surface(record.vertices, record.faces)
     counts = f"connected components {parts.components}, boundary loops (holes) {parts.loops}"
     _tell("surface", f"{counts}, degenerate triangles {parts.degenerate}")
     kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
     _tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
-    if assembly.body is not None and model.body is not None:
-        _tell("body", f"{len(assembly.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
-    if assembly.prepared.betas.size:
-        _tell("shape", f"betas {', '.join(f'{b:.3g}' for b in assembly.prepared.betas)}")
-    for note in (*(() if assembly.body is None else assembly.body.notes), *record.notes):
+    if setting.body is not None and model.body is not None:
+        _tell("body", f"{len(setting.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+    if setting.prepared.betas.size:
+        _tell("shape", f"betas {', '.join(f'{b:.3g}' for b in setting.prepared.betas)}")
+    for note in (*(() if setting.body is None else setting.body.notes), *record.notes):
         _tell("note", note)
-    for name, layer in zip(assembly.scene.garment.over, model.under, strict=False):
+    for name, layer in zip(setting.scene.garment.over, model.under, strict=False):
         _tell("over", f"{name}: {len(layer.rest)} vertices")
     _tell("joints", listed(joints, {name: name for name in joints}))
     if len(model.garment.pins):
-        _tell("pins", f"{len(model.garment.pins)} vertices of the group {assembly.scene.garment.pins}")
+        _tell("pins", f"{len(model.garment.pins)} vertices of the group {setting.scene.garment.pins}")
     _tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
 
 
@@ -110,13 +116,13 @@ def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:
     return list(groups.values())
 
 
-def _tell_motions(assembly: Assembly, groups: Sequence[Sequence[str]]) -> None:
+def _tell_motions(setting: Setting, groups: Sequence[Sequence[str]]) -> None:
     """Print the motions and how they drive the body; what several have in common is printed once, after them."""
-    scene, motions = assembly.scene, assembly.motions
+    scene, motions = setting.scene, setting.motions
     told = [name for group in groups if len(group) > 1 for name in group]
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
         for name in names:
-            _tell(kind, f"{name}: {len(motions[name].poses)} frames at {assembly.model.fps:g} per second")
+            _tell(kind, f"{name}: {len(motions[name].poses)} frames at {setting.model.fps:g} per second")
             for note in () if name in told else motions[name].notes:
                 _tell("", note)
             told.append(name)
@@ -132,21 +138,21 @@ def _tell_motions(assembly: Assembly, groups: Sequence[Sequence[str]]) -> None:
             for note in motions[name].notes:
                 if note not in shared:
                     _tell("", f"{name}: {note}")
-    if not assembly.model.moves:
+    if not setting.model.moves:
         print("  the character never moves: only the static network is trained")
 
 
-def _draw(out: str, assembly: Assembly, groups: Sequence[Sequence[str]]) -> str:
+def _draw(out: str, setting: Setting, groups: Sequence[Sequence[str]]) -> str:
     """Draw one motion of each group; return what the picture shows, nothing where there is none to draw."""
-    if assembly.body is None or not groups:
+    if setting.body is None or not groups:
         return ""
     _say("drawing the motions")
     try:
         from ncs_jax.view.motion_sheet import motion_sheet
 
-        chosen = {name if len(group) == 1 else f"{name}  (and {len(group) - 1} alike)": assembly.motions[name]
+        chosen = {name if len(group) == 1 else f"{name}  (and {len(group) - 1} alike)": setting.motions[name]
                   for group in groups[:DRAWN] for name in group[:1]}  # fmt: skip
-        motion_sheet(out, assembly, chosen)
+        motion_sheet(out, setting, chosen)
     except Exception as error:  # a check is worth as much without its picture
         return f"none: {type(error).__name__} {error}"
     left = f"; {len(groups) - DRAWN} other kinds of motion are not drawn" if len(groups) > DRAWN else ""

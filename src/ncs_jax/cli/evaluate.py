@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_names import split_frames
-from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.spec import Scene, load_scene
 
 __all__ = ["add_commands", "evaluate"]
 
@@ -30,15 +28,28 @@ def add_commands(commands) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON, with every frame")
 
 
+def _scene(options) -> Scene | None:
+    """Return the scene of an animation file, None for a run folder."""
+    target = Path(options.target)
+    if not target.exists():
+        raise InputError("no such run folder or animation", file=target, mend="check the path")
+    if target.is_dir() and not options.scene:
+        return None
+    if not options.scene:
+        raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
+    return load_scene(options.scene)
+
+
 def evaluate(options) -> int:
     """Print how an animation does and how it moves, in physical units."""
+    target, scene = Path(options.target), _scene(options)  # before JAX is imported, which takes a second
+
+    import numpy as np
+
     from ncs_jax.metrics.motion import MEASURES, compare_motion, measure_motion
     from ncs_jax.metrics.quality import QUANTITIES, measure, summarise
     from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 
-    target = Path(options.target)
-    if not target.exists():
-        raise InputError("no such run folder or animation", file=target, mend="check the path")
     rows, moving = {}, {}
 
     def look(run, name, track, vertices):
@@ -49,7 +60,7 @@ def evaluate(options) -> int:
         reference = read_animation_over(options.reference, model, track)
         moving[name] |= compare_motion(model, vertices, reference, track)
 
-    if target.is_dir() and not options.scene:
+    if scene is None:
         run = load_run(target)
         run.check_terms()
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
@@ -62,9 +73,6 @@ def evaluate(options) -> int:
                 still = measure_motion(run.assembly.model, run.animate(track, 0.0), track)["speed"]
                 moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
     else:
-        if not options.scene:
-            raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
-        scene = load_scene(options.scene)
         names = (options.motion,) if options.motion else scene.motions
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")

@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
-from ncs_jax import io
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
 from ncs_jax.scene.spec import Scene
@@ -38,6 +35,9 @@ def add_commands(commands) -> None:
 
 def fit(options) -> int:
     """Fit a garment to a body, write it with a picture, and print what was done to it."""
+    import numpy as np
+
+    from ncs_jax import io
     from ncs_jax.io.mesh.surface import boundary_loops
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.fit import fit as fitted

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import os
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 from ncs_jax.cli import animate, body, check, evaluate, fit, simulate, train, view
@@ -28,6 +30,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs check SCENE                   read a scene and say what is in it, or what is wrong with it
 """
 
+KEPT = 2 << 30  # bytes of compiled programs, at most
 
 # What an interrupted command has kept.
 GOES_ON = {
@@ -41,8 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command, and return its exit code: 0, 2 for input that cannot be used, or 130 when interrupted."""
     parsed = _parser().parse_args(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
-    _keep_compiled_programs()
     if arguments is None:  # the process is ours: tracing makes many objects, and to look for cycles took a tenth of a start
+        _keep_compiled_programs()
         gc.freeze()
         gc.set_threshold(10_000, 20, 50)
     try:
@@ -68,13 +71,26 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _keep_compiled_programs() -> None:
-    """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR if that is set."""
-    import jax
-    import jaxlib
-
-    if jaxlib.__version__ in ("0.10.0", "0.10.1"):  # which log two errors of no consequence for every program kept before
-        jaxlib.utils.absl_set_min_log_level(3)
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    """Have JAX keep compiled programs for the next run, once a command imports it; JAX's own variables win."""
+    if version("jaxlib") in ("0.10.0", "0.10.1"):  # which log two errors of no consequence for every program kept before
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # JAX itself sets 1, which whoever started this process may have left
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    with contextlib.suppress(OSError, RuntimeError):  # no home, or none that can be written to: then none is kept
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ncs-jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        cache.mkdir(parents=True, exist_ok=True)
+        if os.access(cache, os.W_OK):
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+            _trim(cache)
+
+
+def _trim(cache: Path) -> None:
+    """Delete the oldest files of a folder until it holds no more than `KEPT` bytes."""
+    files = sorted((entry.stat().st_mtime, entry.stat().st_size, entry.path) for entry in os.scandir(cache) if entry.is_file())
+    excess = sum(size for _, size, _ in files) - KEPT
+    for _, size, path in files:
+        if excess <= 0:
+            break
+        os.unlink(path)
+        excess -= size

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ncs_jax.cli import arguments
 from ncs_jax.cli.clock import clock
+from ncs_jax.scene.spec import load_scene
 
 __all__ = ["add_commands", "simulate"]
 
@@ -27,6 +28,8 @@ def add_commands(commands) -> None:
 
 def simulate(options) -> int:
     """Simulate a scene's garment with a bar, write it to a file, and print how the solves went."""
+    scene = load_scene(options.scene)  # before JAX is imported, which takes a second
+
     import numpy as np
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -48,7 +51,7 @@ def simulate(options) -> int:
             if not console.is_terminal and (p.frame % 30 == 0 or p.frame == p.frames):
                 print(text, flush=True)
 
-        result = runs_simulate.simulate(options.scene, options.motion, partial=partial, report=show)
+        result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment
     io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices)
     partial.unlink(missing_ok=True)

@@ -40,13 +40,14 @@ def add_commands(commands) -> None:
 
 def train(options) -> int:
     """Train the garment of a scene, perhaps with other hosts."""
+    if options.preset and options.resume:
+        raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
+    scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
+
     import jax
 
     from ncs_jax.runs import train as runs_train
 
-    if options.preset and options.resume:
-        raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
-    scene = load_scene(options.scene, options.preset)
     if options.hosts is not None:
         _join(options.hosts)
     try:
@@ -68,12 +69,13 @@ def train(options) -> int:
 
 def demo(options) -> int:
     """Train the packaged T-shirt, draw it and print how it does on a motion that it never saw."""
+    out, scene = Path(options.out), load_scene(options.scene)
+
     from ncs_jax.runs import train as runs_train
 
-    out = Path(options.out)
     resume = (out / "run.json").exists()
     with _TrainingBar() as bar:
-        run = runs_train.train(options.scene, out, minutes=options.minutes, resume=resume, report=bar.show)
+        run = runs_train.train(scene, out, minutes=options.minutes, resume=resume, report=bar.show)
     quantities = _previews(run, out)
     motion = run.assembly.scene.motion.validation
     print(f"On {motion[0]}, which it never trained on:" if motion else "On its motion:")

@@ -155,7 +155,7 @@ def corrected(
     correctives: Correctives | None,
     matrices: Float[Array, "joints 3 4 *poses"],
     parents: Sequence[int],
-) -> Float[Array, "verts 3 *poses"]:
+) -> Float[Array, "verts 3 *#poses"]:
     """Return unposed positions as a pose corrects them, m: x + P vec(R_j - I) (Loper et al. 2015, (9)); x where P is None.
 
     R_j = R_parent^T R_world are the local rotations in the joints' transforms, in any number of poses.

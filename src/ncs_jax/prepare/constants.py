@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ncs_jax.energies.contact.pairs import groups_from
@@ -35,16 +35,17 @@ def model_from(files: SceneFiles, prepared: Prepared, dtype) -> Model:
     kept_parents = tuple(number[int(parents[j])] if parents[j] >= 0 else -1 for j in kept)
     body_points = body_blend = None
     if collides and body is not None:
-        body_points = jnp.asarray(body.vertices[prepared.part], dtype)
+        body_points = jax.device_put(np.asarray(body.vertices[prepared.part], dtype))
         body_blend = blend_from(body_weights[:, kept], dtype=dtype)
     keeps_apart = physics.self_contact.stiffness > 0
+    pins, groups = jax.device_put(files.pins), groups_from(files.mesh) if keeps_apart else None
     return Model(
-        skeleton=Skeleton(jnp.asarray(joints[kept], dtype), kept_parents),
-        rest_rotations=None if rest_rotations is None else jnp.asarray(rest_rotations[kept], dtype),
-        garment=Garment(files.mesh, jnp.asarray(files.pins, jnp.int32), groups_from(files.mesh) if keeps_apart else None),
+        skeleton=Skeleton(jax.device_put(np.asarray(joints[kept], dtype)), kept_parents),
+        rest_rotations=None if rest_rotations is None else jax.device_put(np.asarray(rest_rotations[kept], dtype)),
+        garment=Garment(files.mesh, pins, groups),
         blend=blend_from(prepared.weights[:, kept], dtype=dtype),
         material=_material(physics, dtype),
-        basis=jnp.asarray(prepared.basis, dtype),
+        basis=jax.device_put(np.asarray(prepared.basis, dtype)),
         body=body_points,
         body_blend=body_blend,
         surface=None,
@@ -73,18 +74,22 @@ def _membrane(physics: PhysicsSpec) -> tuple[str | None, tuple[float, ...]]:
 
 def _material(physics: PhysicsSpec, dtype) -> Material:
     """Return the numbers of the physics as arrays."""
+
+    def array(value):  # without a program for every shape
+        return jax.device_put(np.asarray(value, dtype))
+
     keeps_apart = physics.self_contact.stiffness > 0
     return Material(
-        density=jnp.asarray(physics.density, dtype),
-        membrane=tuple(jnp.asarray(n, dtype) for n in _membrane(physics)[1]),
-        bending=jnp.asarray(physics.bending.stiffness, dtype),
-        collision=jnp.asarray(physics.collision.stiffness, dtype),
-        thickness=jnp.asarray(physics.collision.thickness, dtype),
-        friction=jnp.asarray(physics.collision.friction, dtype),
-        pinning=jnp.asarray(physics.pinning.stiffness, dtype),
-        gravity=jnp.asarray(physics.gravity, dtype),
-        self_contact=jnp.asarray(physics.self_contact.stiffness, dtype) if keeps_apart else None,
-        self_thickness=jnp.asarray(physics.self_contact.thickness, dtype) if keeps_apart else None,
+        density=array(physics.density),
+        membrane=tuple(array(n) for n in _membrane(physics)[1]),
+        bending=array(physics.bending.stiffness),
+        collision=array(physics.collision.stiffness),
+        thickness=array(physics.collision.thickness),
+        friction=array(physics.collision.friction),
+        pinning=array(physics.pinning.stiffness),
+        gravity=array(physics.gravity),
+        self_contact=array(physics.self_contact.stiffness) if keeps_apart else None,
+        self_thickness=array(physics.self_contact.thickness) if keeps_apart else None,
     )
 
 

@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import LINE, relative_heights
+from ncs_jax.geometry.mesh import LINE, relative_heights, topology
+from ncs_jax.geometry.surface_distance import signed_distance
 from ncs_jax.io import MotionRecord
-from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms, world_axes
 from ncs_jax.prepare.posture_checks import posture_faults
-from ncs_jax.scene.model import Model, local_rotations, pose_body, pose_rest
+from ncs_jax.prepare.setting import Setting
+from ncs_jax.prepare.touchable import touchable_faces
+from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene
 
 __all__ = ["RANGES", "Risk", "find_risks"]
@@ -41,6 +41,7 @@ MANY = 0.02  # and the share of the vertices that may be deeper
 JUMP = 0.3  # m within a frame: the thickness of a limb
 TURN = 90.0  # degrees within a frame
 POSES = 8  # checked in every motion
+CLEAR = 0.02  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def _material(scene: Scene) -> Iterator[Risk]:
             yield from _outside("stiffness", value / usual, f"{value / usual:.3g} times the default", rounding, field)
 
 
-def _mesh(a: Assembly) -> Iterator[Risk]:
+def _mesh(a: Setting) -> Iterator[Risk]:
     """Yield the risks of the garment's size and of triangles and vertices that are degenerate."""
     x, faces = np.asarray(a.garment.vertices, np.float64), np.asarray(a.garment.faces)
     size = float(np.ptp(x, axis=0).max())
@@ -106,23 +107,45 @@ def _mesh(a: Assembly) -> Iterator[Risk]:
         yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
 
 
-@jax.jit
-def _distances(model: Model, matrices):
-    """Return signed distances (verts,), m, to the body of the garment as the body alone carries it in one pose."""
-    return nearest_distance(pose_rest(model, matrices), pose_body(model, matrices), required(model.surface, "model.surface"))
+def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m, or -`CLEAR` if clear of it."""
+    model, body = a.model, required(a.body, "body")
+    rest, skin = (np.asarray(x, np.float64) for x in (model.garment.mesh.rest, required(model.body, "model.body")))
+    edges, sides, _ = topology(faces)
+    border = np.zeros(faces.max() + 1, bool)
+    border[edges[sides[:, 1] < 0]] = True
+    depths = []
+    for pose, transforms in zip(poses, joint_transforms(body, poses)[:, list(model.source_joints)], strict=True):
+        bare = corrected_rest(skin, model.correctives, transforms, model.skeleton.parents)
+        surface = [carried(bare, required(model.body_blend, "model.body_blend"), transforms), *_worn_below(model, pose)]
+        x = carried(rest, model.blend, transforms)
+        depths.append(-signed_distance(x, np.concatenate(surface), faces, border, CLEAR))
+    return np.stack(depths)
 
 
-def _inside(model: Model, poses: np.ndarray, when: str, deep: float, many: float, mend: str) -> Iterator[Risk]:
-    """Yield a risk where, in some pose, a share `many` of the garment is more than `deep` (m) inside the body."""
-    still = [MotionRecord(pose[None], np.zeros((1, 3), poses.dtype), model.fps) for pose in poses]
-    depth = -np.stack([_distances(model, features_from_records(model, one).matrices[0]) for one in still])
+def _worn_below(model: Model, pose: np.ndarray) -> list[np.ndarray]:
+    """Return the vertices of the garments below in a pose that is held, m."""
+    if not model.under:
+        return []
+    from ncs_jax.network.rollout import animated
+    from ncs_jax.prepare.build import features_from_records
+
+    still = MotionRecord(pose[None], np.zeros((1, 3), pose.dtype), model.fps)
+    return [animated(g.model, g.network, g.params, features_from_records(g.model, still))[0] for g in model.under]
+
+
+def _inside(
+    a: Setting, faces: np.ndarray, poses: np.ndarray, when: str, limits: tuple[float, float], mend: str
+) -> Iterator[Risk]:
+    """Yield a risk where, in some pose, more than a share of the garment is deeper (m) inside the body than the limits say."""
+    (deep, many), depth = limits, _depths(a, faces, poses)
     share = float((depth > deep).mean(axis=1).max())
     if share > many:
         value = f"{100 * share:.1f} % of its vertices by more than {1000 * deep:.0f} mm, up to {1000 * depth.max():.1f} mm"
         yield Risk(f"garment inside the body {when}", value, "contact pushes it out on the nearer side, right or wrong", mend)
 
 
-def _motion(a: Assembly, name: str) -> Iterator[Risk]:
+def _motion(a: Setting, faces: np.ndarray | None, name: str) -> Iterator[Risk]:
     """Yield the risks of a motion: how far it goes, jumps and turns within a frame, cloth inside the body."""
     from scipy.spatial.transform import Rotation
 
@@ -135,7 +158,8 @@ def _motion(a: Assembly, name: str) -> Iterator[Risk]:
     if steps.max(initial=0) > JUMP:
         value = f"{steps.max():.2f} m in {name}, frame {1 + int(steps.argmax())}"
         yield Risk("jump within a frame", value, "the cloth is left behind, then torn along", "cut the motion there")
-    local = np.asarray(local_rotations(model, jnp.asarray(record.poses, model.basis.dtype)))
+    axes = None if model.rest_rotations is None else np.asarray(model.rest_rotations, np.float64)
+    local = world_axes(record.poses[:, list(model.source_joints)], axes)
     if len(local) > 1:
         turns = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
         turn = np.degrees(Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()).reshape(turns.shape[:2])
@@ -145,10 +169,11 @@ def _motion(a: Assembly, name: str) -> Iterator[Risk]:
             label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
             value = f"{turn.max():.0f} degrees in {name}, frame {frame + 1}, joint {label}"
             yield Risk("turn within a frame", value, "a limb passes through cloth", "clean the motion there")
-    if model.surface is not None:
+    if faces is not None:
         frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
         mend = "mend the pose, or smooth the skinning weights"
-        yield from _inside(model, record.poses[frames], f"where the body alone carries it in {name}", DEEP, MANY, mend)
+        when = f"where the body alone carries it in {name}"
+        yield from _inside(a, faces, record.poses[frames], when, (DEEP, MANY), mend)
 
 
 def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
@@ -157,7 +182,7 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
         yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
 
 
-def _postures(a: Assembly) -> Iterator[Risk]:
+def _postures(a: Setting) -> Iterator[Risk]:
     """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
     world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
     for name, record in a.motions.items():
@@ -165,13 +190,14 @@ def _postures(a: Assembly) -> Iterator[Risk]:
             yield Risk(what, f"{value} of {name}", risk, mend)
 
 
-def find_risks(a: Assembly) -> list[Risk]:
+def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += [*_postures(a), *_material(a.scene), *_mesh(a)]
-    if a.model.surface is not None:
-        joints = 1 if a.body is None else len(a.body.parents)
-        found += _inside(a.model, np.zeros((1, joints, 3)), "at rest", 0.0, 0.0, "push it out: ncs fit")
+    faces = None
+    if a.model.body is not None and a.body is not None:
+        faces = touchable_faces(a.model, a.body, a.prepared.part)
+        found += _inside(a, faces, np.zeros((1, len(a.body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
     for name in a.motions:
-        found += _motion(a, name)
+        found += _motion(a, faces, name)
     return found

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.nearest import nearest_triangle
-from ncs_jax.energies.contact.surface import Surface, surface_from
-from ncs_jax.geometry.closest_point import closest_weights
 from ncs_jax.geometry.mesh import adjacency
+from ncs_jax.geometry.surface_distance import closest_on_surface
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 
@@ -21,16 +17,8 @@ __all__ = ["smooth_weights", "transfer_weights", "used_joints", "with_body_weigh
 
 def transfer_weights(garment: np.ndarray, body: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return a garment's skinning weights (verts, joints): the body's, interpolated at the nearest point of its **surface**."""
-    x, points = jnp.asarray(garment, jnp.float32), jnp.asarray(body, jnp.float32)
-    index, barycentric = _nearest(x, points, surface_from(garment, body, faces))
-    return np.einsum("vk,vkj->vj", np.asarray(barycentric, np.float64), np.asarray(weights)[faces[np.asarray(index)]])
-
-
-@jax.jit
-def _nearest(x, body, surface: Surface):
-    """Return the nearest triangle of every point, and the weights of its corners at the nearest point of it."""
-    index, _ = nearest_triangle(x, body, surface)
-    return index, closest_weights(x, body[surface.faces[index]])
+    nearest = closest_on_surface(garment, body, faces)
+    return np.einsum("vk,vkj->vj", nearest.weights, np.asarray(weights)[faces[nearest.face]])
 
 
 def smooth_weights(weights: np.ndarray, edges: np.ndarray, times: int) -> np.ndarray:

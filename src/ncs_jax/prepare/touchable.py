@@ -2,67 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
 from ncs_jax.energies.contact.surface import Surface, surface_from
-from ncs_jax.geometry.rotations import axis_angle_to_matrix
-from ncs_jax.geometry.skinning import (
-    Blend,
-    Correctives,
-    Skeleton,
-    blend,
-    blend_from,
-    corrected,
-    correctives_from,
-    forward,
-    skin,
-    transforms,
-)
+from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
+from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
 
-__all__ = ["Skinned", "covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = ["covered_by_layers", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
 
-class Skinned(NamedTuple):
-    """Vertices at rest (verts, 3), m, with what poses them."""
-
-    rest: np.ndarray
-    blend: Blend
-    correctives: Correctives | None = None
-
-
-def touchable(skeleton: Skeleton, garment: Skinned, body: Skinned, rotations: Sequence[np.ndarray], reach: float) -> np.ndarray:
+def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, poses: np.ndarray, reach: float) -> np.ndarray:
     """Return which body vertices (body,) come within `reach` (m) of the skinned rest garment in any of the given poses.
 
-    `rotations` holds the local rotations (joints, 3, 3) of every pose. The rest pose is always checked too.
+    `poses` are axis-angle (frames, joints, 3). The rest pose is always checked too.
     """
     from scipy.spatial import cKDTree
 
-    near = np.zeros(len(body.rest), bool)
-    rest = np.broadcast_to(np.eye(3), (len(skeleton.parents), 3, 3))
-    dtype = skeleton.joints.dtype
-    worn = [(jnp.asarray(w.rest, dtype), w.blend, w.correctives) for w in (garment, body)]
-    for local in [rest, *rotations]:
-        cloth, skin_ = map(np.asarray, _posed(skeleton, worn, jnp.asarray(local, dtype)))
-        distance, _ = cKDTree(cloth).query(skin_, distance_upper_bound=reach)
+    near, body_blend = np.zeros(len(body.vertices), bool), blend_from(body.weights)
+    more = None if body.posedirs is None else correctives_from(body.posedirs)
+    for transforms in joint_transforms(body, np.concatenate([np.zeros((1, len(body.parents), 3)), poses])):
+        cloth = carried(garment, garment_blend, transforms)
+        skin = carried(corrected_rest(body.vertices, more, transforms, body.parents), body_blend, transforms)
+        distance, _ = cKDTree(cloth).query(skin, distance_upper_bound=reach)
         near |= np.isfinite(distance)
     return near
-
-
-@jax.jit
-def _posed(skeleton: Skeleton, worn, local) -> list[jax.Array]:
-    """Return vertices (m) posed by local rotations, of all at rest with their skinning weights and pose correctives."""
-    m = transforms(skeleton, forward(skeleton, local, jnp.zeros(3, local.dtype)))
-    return [skin(blend(m, weights), corrected(rest, more, m, skeleton.parents)) for rest, weights, more in worn]
 
 
 COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
@@ -122,23 +91,13 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     """Return the numbers of the body vertices that the garment can touch in the scene's motions."""
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
-    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
     poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(body.parents), 3), np.float32)
     some = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
-    local = np.asarray(jax.jit(axis_angle_to_matrix)(jnp.asarray(some)))
-    if body.rest_rotations is not None:
-        local = body.rest_rotations @ local @ np.swapaxes(body.rest_rotations, -1, -2)
     # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
     corners = body.vertices[body.faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
-    more = None if body.posedirs is None else correctives_from(body.posedirs)
-    near = touchable(
-        skeleton,
-        Skinned(garment.vertices, blend_from(weights)),
-        Skinned(body.vertices, blend_from(body.weights), more),
-        list(local),
-        scene.physics.collision.reach + edge / np.sqrt(3),
-    )
+    reach = scene.physics.collision.reach + edge / np.sqrt(3)
+    near = touchable(body, garment.vertices, blend_from(weights), some, reach)
     return np.unique(body.faces[near[body.faces].any(axis=1)])
 
 

@@ -22,13 +22,14 @@ from ncs_jax.network.rollout import animated, first_broken
 from ncs_jax.prepare.build import Assembly, build, features_from_records
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.prepared import Prepared
+from ncs_jax.prepare.setting import Below
 from ncs_jax.runs.checkpoint import Checkpoints, read_prepared, read_run
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model
+from ncs_jax.scene.model import Layer, Model
 from ncs_jax.scene.spec import Scene, scene_from
 from ncs_jax.training.step import initial_state
 
-__all__ = ["NetworkMaker", "Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over"]
+__all__ = ["NetworkMaker", "Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over", "worn_below"]
 
 
 NetworkMaker = Callable[[Scene, Model], Method]  # makes a network of one's own, sized for a model
@@ -206,11 +207,16 @@ def assemble(
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
-    below = [load_run(scene.path(name)) for name in scene.garment.over]
-    assembly = build(scene, prepared=prepared, below=[(run.assembly, run.params) for run in below], dtype=dtype, report=report)
+    assembly = build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report)
     if terms:
         assembly = replace(assembly, model=assembly.model.with_terms(terms))
     return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
+
+
+def worn_below(scene: Scene) -> list[Below]:
+    """Return the trained garments that a scene's garment is worn over, each with the body that it was trained on."""
+    runs = [load_run(scene.path(name)) for name in scene.garment.over]
+    return [(run.assembly.body, Layer(run.assembly.model, run.params, run.assembly.network)) for run in runs]
 
 
 def read_animation_over(file: str | Path, model: Model, track: MotionFeatures) -> np.ndarray:

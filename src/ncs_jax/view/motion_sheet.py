@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.records import SkeletonPoses, shown_frames
-from ncs_jax.prepare.build import Assembly
 from ncs_jax.prepare.joint_names import side_and_rest
+from ncs_jax.prepare.posing import joint_transforms
+from ncs_jax.prepare.setting import Setting
 from ncs_jax.view.animation import upright
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
@@ -35,51 +35,41 @@ FINE = 3  # drawn so many times larger, then made smaller, for smooth lines
 SIDES = {"left": (38, 110, 190), "right": (200, 72, 40), "": INK}
 
 
-def posed(body: BodyRecord, motion: MotionRecord, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints' places (n, J, 3), and what takes rest points to some frames by each joint (n, J, 3, 4), in m."""
-    poses = motion.poses[frames].astype(np.float64)
-    turns = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
-    if body.rest_rotations is not None:
-        turns = body.rest_rotations @ turns @ np.swapaxes(body.rest_rotations, 1, 2)
-    joints = body.joints.astype(np.float64)
-    places = np.zeros(poses.shape)
-    for j, parent in enumerate(body.parents):
-        if parent < 0:
-            places[:, j] = joints[j] + motion.translation[frames]
-        else:
-            turns[:, j] = turns[:, parent] @ turns[:, j]
-            places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent])
-    moved = places - np.einsum("njab,jb->nja", turns, joints)
-    return places, np.concatenate([turns, moved[..., None]], axis=-1)
+def posed(body: BodyRecord, motion: MotionRecord, frames: np.ndarray) -> np.ndarray:
+    """Return what takes rest points to some frames by each joint (n, J, 3, 4), in m."""
+    matrices = joint_transforms(body, motion.poses[frames])
+    matrices[..., 3] += motion.translation[frames, None]
+    return matrices
 
 
-def motion_sheet(path: str | Path, assembly: Assembly, motions: Mapping[str, MotionRecord]) -> None:
+def motion_sheet(path: str | Path, setting: Setting, motions: Mapping[str, MotionRecord]) -> None:
     """Write a PNG of motions: above, the character with its garment skinned to it; below, the skeleton as it was recorded.
 
     The skeleton is drawn to the character's scale and from its side: where a motion was read rightly, both do the same. Blue is
     its left, red its right. A motion of the body's own joints has the body's own skeleton below.
 
     Args:
-        path: of the PNG. assembly: of a scene with a body. motions: to draw, each under its title.
+        path: of the PNG. setting: of a scene with a body. motions: to draw, each under its title.
     """
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        rows = list(pool.map(lambda title: _motion_row(title, assembly, motions[title]), motions))
+        rows = list(pool.map(lambda title: _motion_row(title, setting, motions[title]), motions))
     sheet = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
     for number, row in enumerate(rows):
         sheet.paste(row, (0, number * row.height))
     sheet.save(path, format="PNG")
 
 
-def _motion_row(title: str, assembly: Assembly, record: MotionRecord) -> Image.Image:
+def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Image:
     """Return one motion: its title, the character and the skeleton in some frames, and their times."""
-    body = required(assembly.body, "body.file", "name a body")
-    gravity = np.array(assembly.scene.physics.gravity)
+    body = required(setting.body, "body.file", "name a body")
+    gravity = np.array(setting.scene.physics.gravity)
     up = tuple((-gravity).tolist()) if np.any(gravity) else (0.0, 1.0, 0.0)
     frames = shown_frames(len(record.poses))
-    joints, matrices = posed(body, record, frames)
-    rest, garment = upright(body.vertices, up), assembly.garment
+    matrices = posed(body, record, frames)
+    joints = np.einsum("njab,jb->nja", matrices[..., :3], body.joints) + matrices[..., 3]
+    rest, garment = upright(body.vertices, up), setting.garment
     skin = upright(_skinned(matrices, body.weights, body.vertices), up)
-    cloth = upright(_skinned(matrices, assembly.prepared.weights, garment.vertices), up)
+    cloth = upright(_skinned(matrices, setting.prepared.weights, garment.vertices), up)
     floor = float(rest[:, 1].min())
     source = record.source or SkeletonPoses(joints, body.parents, body.joint_names or ("",) * len(body.parents))
     bones = upright(source.places[: len(frames)], up)

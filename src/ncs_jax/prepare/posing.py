@@ -1,0 +1,55 @@
+"""A character posed on the host, in float64: for preparations and checks, which are done once and compile nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ncs_jax.geometry.skinning import Blend, Correctives
+from ncs_jax.io.records import BodyRecord
+
+__all__ = ["carried", "corrected_rest", "joint_transforms", "world_axes"]
+
+
+def world_axes(poses: np.ndarray, rest_rotations: np.ndarray | None) -> np.ndarray:
+    """Return local rotations since rest along the world's axes (frames, joints, 3, 3) of axis-angle poses.
+
+    Args:
+        poses: (frames, joints, 3) in each joint's own axes, `rest_rotations` (joints, 3, 3); None: they are the world's.
+    """
+    from scipy.spatial.transform import Rotation
+
+    local = Rotation.from_rotvec(poses.reshape(-1, 3).astype(np.float64)).as_matrix().reshape(*poses.shape, 3)
+    return local if rest_rotations is None else rest_rotations @ local @ np.swapaxes(rest_rotations, -1, -2)
+
+
+def joint_transforms(body: BodyRecord, poses: np.ndarray) -> np.ndarray:
+    """Return the rigid motion [R_j | t_j] (frames, joints, 3, 4) of every joint from rest to pose, its root in place."""
+    turns, joints = world_axes(poses, body.rest_rotations), body.joints.astype(np.float64)
+    places = np.broadcast_to(joints, (len(poses), *joints.shape)).copy()
+    for j, parent in enumerate(body.parents):  # parents come first
+        if parent >= 0:
+            turns[:, j] = turns[:, parent] @ turns[:, j]
+            places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent])
+    shift = places - np.einsum("tjab,jb->tja", turns, joints)
+    return np.concatenate([turns, shift[..., None]], axis=-1)
+
+
+def carried(rest: np.ndarray, weights: Blend, transforms: np.ndarray) -> np.ndarray:
+    """Return vertices (verts, 3), m, in one pose, by linear blend skinning of those at rest; transforms (joints, 3, 4)."""
+    used = transforms[list(weights.joints)].reshape(-1, 12)
+    blended = (np.asarray(weights.weights, np.float64) @ used).reshape(-1, 3, 4)
+    return np.einsum("vab,vb->va", blended[:, :, :3], rest) + blended[:, :, 3]
+
+
+def corrected_rest(
+    rest: np.ndarray, correctives: Correctives | None, transforms: np.ndarray, parents: Sequence[int] | np.ndarray
+) -> np.ndarray:
+    """Return vertices at rest (verts, 3), m, as one pose corrects them: `skinning.corrected`; transforms (joints, 3, 4)."""
+    if correctives is None or not correctives.joints:
+        return rest
+    joints = np.array(correctives.joints)
+    turns, above = transforms[joints, :, :3], transforms[np.asarray(parents)[joints], :, :3]
+    entries = (np.swapaxes(above, -1, -2) @ turns - np.eye(3)).ravel()
+    return rest + np.asarray(correctives.directions, np.float64) @ entries

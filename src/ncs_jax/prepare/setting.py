@@ -1,0 +1,184 @@
+"""A scene set up: its files read and checked against each other, and what is found out once from them.
+
+That is all that a check needs. `build` adds what moves: features of the motions, the body's surface, the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+from ncs_jax.geometry.mesh import mesh_from
+from ncs_jax.prepare.constants import model_from
+from ncs_jax.prepare.garment_checks import check_on_body
+from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
+from ncs_jax.prepare.skinning_weights import with_body_weights
+from ncs_jax.scene.model import Layer, Model
+from ncs_jax.scene.spec import Scene
+
+__all__ = ["Below", "Setting", "check_hangs", "set_up"]
+
+
+Below = tuple[io.BodyRecord | None, Layer]  # a trained garment that is worn below, and the body that it was trained on
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A scene set up. `body` and `garment` are the records as read; `model` has neither the body's surface nor vibrations."""
+
+    scene: Scene
+    prepared: Prepared
+    model: Model
+    body: io.BodyRecord | None
+    garment: io.GarmentRecord
+    motions: dict[str, io.MotionRecord]
+
+
+def set_up(
+    scene: Scene,
+    *,
+    prepared: Prepared | None = None,
+    below: Sequence[Below] = (),
+    dtype=jnp.float32,
+    report: Callable[[str], None] | None = None,
+) -> Setting:
+    """Read every file of a scene, check that they fit together, and find out what `Prepared` holds, vibrations aside.
+
+    Args:
+        scene, prepared, below, dtype, report: see `build.build`.
+
+    Raises:
+        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+    """
+    say = report or (lambda words: None)
+    say(f"reading {scene.garment.file} and {scene.body.file}")
+    betas = _betas(scene) if prepared is None else prepared.betas
+    files = _read(scene, betas, below, dtype)
+    motions: dict[str, io.MotionRecord] = {}
+    if prepared is None:
+        for name in dict.fromkeys(scene.motions):
+            say(f"reading {name}")
+            motions[name] = load_motion(scene, name, files.body)
+        say("preparing the garment")
+        prepared = replace(prepare_scene(files, [motions[name] for name in scene.motion.files]), betas=betas)
+    model = model_from(files, prepared, dtype)
+    check_hangs(scene, model)
+    return Setting(scene, prepared, model, files.body, files.garment, motions)
+
+
+def check_hangs(scene: Scene, model: Model, found: bool = True) -> None:
+    """Raise an InputError where a swing is asked of a garment that nothing holds, or for which none was `found`."""
+    network = scene.network
+    if network.method != "ncs" or network.cell != "swing" or not model.terms.inertia:
+        return
+    if not found or (not model.terms.pinning and model.body is None):
+        raise InputError(
+            "a garment that hangs on something, and swings, expected", file=scene.source, field="network.cell", value="swing",
+            mend="pin it, put it on a body, or choose the gated or the linear cell",
+        )  # fmt: skip
+
+
+def _betas(scene: Scene) -> np.ndarray:
+    """Return the shape of the scene's body: its own betas, or those on which all its motions agree."""
+    if not isinstance(scene.body.betas, str):
+        return np.array(scene.body.betas, np.float64)
+    found = {name: io.read_betas(scene.path(name)) for name in scene.motions}
+    if not found:
+        raise InputError(
+            "a motion with betas expected", file=scene.source, field="body.betas", value=scene.body.betas, mend="write numbers"
+        )
+    first = next(iter(found))
+    for name, betas in found.items():
+        both = np.zeros((2, max(len(betas), len(found[first]))))
+        both[0, : len(betas)], both[1, : len(found[first])] = betas, found[first]
+        if np.abs(both[0] - both[1]).max(initial=0) > 1e-4:
+            raise InputError(
+                "motions of one person expected: their betas differ", file=scene.source, field="body.betas",
+                value=f"{first} and {name}", mend="write the betas as numbers, or take motions of one person",
+            )  # fmt: skip
+    return np.trim_zeros(found[first], "b")
+
+
+def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> SceneFiles:
+    """Read the files of a scene but for its motions, and check that they fit together."""
+    body, person, spec = None, scene.body, scene.garment
+    if person.file not in ("", "none"):
+        body = io.read_body(
+            scene.path(person.file),
+            betas=betas.tolist(),
+            shapes=person.shapes,
+            part=person.meshes,
+            correctives=person.correctives,
+        )
+    garment = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    if body is not None:
+        garment = with_body_weights(garment, body)
+    if body is not None:
+        _check_body(scene.path(scene.body.file), body)
+        _check_garment(scene, garment, body)
+    pins, layers = _pins(scene, garment), _layers(scene, body, below, dtype)
+    mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
+    return SceneFiles(scene, body, garment, mesh, pins, layers)
+
+
+def _check_body(file: Path, body: io.BodyRecord) -> None:
+    """Raise an InputError unless the body has the size of a character in metres."""
+    height = np.ptp(body.vertices, axis=0).max()
+    if not 0.3 < height < 5:
+        raise InputError(
+            "a body in metres expected, 0.3 to 5 m tall", file=file, field="vertices", value=f"{height:.3g} m",
+            mend="scale it to metres",
+        )  # fmt: skip
+
+
+def _check_garment(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
+    """Raise an InputError unless the garment lies on the body, and its own weights, if any, are for the body's joints."""
+    file = scene.path(scene.garment.file)
+    if garment.weights is not None and garment.weights.shape[1] != len(body.parents):
+        raise InputError(
+            f"a weight for each of the body's {len(body.parents)} joints expected", file=file, field="blend_weights",
+            value=garment.weights.shape, mend="fit the garment to this body again: ncs fit",
+        )  # fmt: skip
+    check_on_body(file, garment, body.vertices, axis_given=bool(scene.garment.up))
+
+
+def _pins(scene: Scene, garment: io.GarmentRecord) -> np.ndarray:
+    """Return the numbers of the vertices in the group `garment.pins`, none where no group is named."""
+    name = scene.garment.pins
+    if not name:
+        return np.zeros(0, np.int32)
+    if name not in garment.groups:
+        groups = ", ".join(garment.groups) or "none"
+        raise InputError(
+            "no such vertex group in the garment", file=scene.source, field="garment.pins", value=name,
+            mend=f"name one of its groups: {groups}",
+        )  # fmt: skip
+    return np.asarray(garment.groups[name], np.int32)
+
+
+def _layers(scene: Scene, body: io.BodyRecord | None, below: Sequence[Below], dtype) -> tuple[Layer, ...]:
+    """Return the garments worn below, each checked against this scene."""
+    found = []
+    for i, (name, (other, worn)) in enumerate(zip(scene.garment.over, below, strict=True)):
+        field, model = f"garment.over[{i}]", worn.model
+        if body is None or other is None or not np.array_equal(other.vertices, body.vertices):
+            raise InputError(
+                "a garment on the same body expected", file=scene.source, field=field, value=name,
+                mend="train it on the body that [body] names",
+            )  # fmt: skip
+        if model.fps != scene.motion.fps:
+            raise InputError(
+                f"a garment trained at {scene.motion.fps:g} frames per second expected", file=scene.source, field=field,
+                value=model.fps, mend="give both scenes the same motion.fps",
+            )  # fmt: skip
+        layer = replace(worn, model=replace(model, body=None, body_blend=None, correctives=None, surface=None, under=()))
+        found.append(jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, layer))
+    return tuple(found)

@@ -1,0 +1,167 @@
+"""What a user waits for before anything happens: help without JAX, a check without programs, kept programs and preparations."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.cli import parser
+from ncs_jax.energies.contact.distance import nearest_distance
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.geometry.surface_distance import closest_on_surface, signed_distance
+from ncs_jax.prepare.kept import kept
+from ncs_jax.simulation.ritz_modes import _Band
+
+from .scenes import SCENE, write_scene
+
+SOURCE = str(Path(__file__).parents[1] / "src")
+WORDS = (["--help"], ["train", "--help"], ["train", "--wrong"], ["nothing"], ["check", "--fields"], ["check", "no.toml"])
+LIGHT = f"""
+import contextlib, json, sys
+from ncs_jax.cli.parser import main
+for words in {[*WORDS, ["train", "no.toml", "--out", "r"], ["simulate", "no.toml", "--out", "r.npz"], ["evaluate", "no"]]}:
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(None):
+        main(words)
+    print(json.dumps([words, sorted({{"jax", "numpy"}} & set(sys.modules))]))
+"""
+COUNTED = """
+import json, sys
+import jax
+count = []
+jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: count.append(name))
+from ncs_jax.cli.parser import main
+assert main(["check", sys.argv[1]]) == 0
+heavy = {"flax", "optax", "orbax"} & set(sys.modules)
+print(json.dumps([sum("backend_compile" in name for name in count), sorted(heavy)]))
+"""
+
+
+def printed(script, *arguments, folder):
+    line = [sys.executable, "-c", script, *map(str, arguments)]
+    done = subprocess.run(
+        line, env={**os.environ, "PYTHONPATH": SOURCE}, capture_output=True, text=True, cwd=folder, check=True
+    )
+    return [json.loads(row) for row in done.stdout.splitlines() if row.startswith("[")]
+
+
+def test_words_and_missing_files_do_not_wait_for_jax(tmp_path):
+    rows = printed(LIGHT, folder=tmp_path)
+    assert len(rows) == len(WORDS) + 3
+    assert not [row for row in rows if row[1]]
+
+
+def test_a_check_compiles_next_to_nothing_and_loads_no_network(tmp_path):
+    """Each program takes 20 ms, or seconds: of the check of a swing there were a hundred, nine of them large."""
+    scene = write_scene(tmp_path, SCENE.replace("[network]", '[network]\ncell = "swing"'))
+    ((programs, heavy),) = printed(COUNTED, scene, folder=tmp_path)
+    assert 0 < programs <= 10 and not heavy
+
+
+def ball(rows=9, around=14):
+    """A ball without its lowest cap: a surface with a rim."""
+    up, turn = np.linspace(0, 2.4, rows)[1:, None], 2 * np.pi * np.arange(around) / around
+    ring = np.stack([np.sin(up) * np.cos(turn), np.cos(up) + 0 * turn, np.sin(up) * np.sin(turn)], axis=-1)
+    x = np.concatenate([[[0, 1, 0]], ring.reshape(-1, 3)])
+    k, after = np.arange(around), (np.arange(around) + 1) % around
+    faces = [np.stack([0 * k, 1 + after, 1 + k], axis=1)]
+    for r in range(rows - 2):
+        low, high = 1 + r * around, 1 + (r + 1) * around
+        faces += [np.stack([low + k, low + after, high + k], axis=1), np.stack([low + after, high + after, high + k], axis=1)]
+    return 0.2 * x, np.concatenate(faces).astype(np.int32)
+
+
+def test_distances_on_the_host_are_those_of_the_program():
+    body, faces = ball()
+    x = np.random.default_rng(0).normal(size=(400, 3)) * 0.2
+    surface = surface_from(x, body, faces)
+    border = np.asarray(surface.border)
+    expected = np.asarray(jax.jit(nearest_distance)(jnp.asarray(x), jnp.asarray(body), surface))
+    assert (expected < -0.02).sum() > 30 and border.any()
+    found = signed_distance(x, body, faces, border)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    near = signed_distance(x, body, faces, border, 0.05)
+    far = near == 0.05
+    assert 50 < far.sum() < 350 and (expected[far] > 0).all()
+    np.testing.assert_allclose(near[~far], expected[~far], atol=1e-12)
+
+
+def test_the_closest_point_is_on_its_triangle():
+    body, faces = ball()
+    x = np.random.default_rng(1).normal(size=(50, 3))
+    points = closest_on_surface(x, body, faces)
+    there = np.einsum("nk,nkd->nd", points.weights, body[faces[points.face]])
+    np.testing.assert_allclose(points.weights.sum(axis=1), 1)
+    assert (points.weights >= 0).all()
+    np.testing.assert_allclose(x - there, points.gap, atol=1e-12)
+
+
+def test_a_band_solves_as_a_dense_matrix_does():
+    rng, verts = np.random.default_rng(0), 12
+    pairs = np.array([(i, j) for i in range(verts) for j in range(i) if rng.random() < 0.4])
+    off, right = rng.normal(size=(len(pairs), 3, 3)), rng.normal(size=3 * verts)
+    diagonal = 40 * np.eye(3) + rng.normal(size=(verts, 3, 3))
+    diagonal = (diagonal + np.swapaxes(diagonal, 1, 2)) / 2
+    dense = np.zeros((verts, 3, verts, 3))
+    dense[range(verts), :, range(verts)] = diagonal
+    dense[pairs[:, 0], :, pairs[:, 1]] = off
+    dense[pairs[:, 1], :, pairs[:, 0]] = np.swapaxes(off, 1, 2)
+    found = _Band(pairs, verts).solved(diagonal, off, right)
+    np.testing.assert_allclose(found, np.linalg.solve(dense.reshape(3 * verts, -1), right), rtol=1e-10)
+
+
+@pytest.fixture
+def folder_of_programs(tmp_path):
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "programs"))
+    yield tmp_path / "programs"
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_what_was_found_is_found_again_and_only_that(folder_of_programs):
+    calls = []
+
+    def found():
+        calls.append(1)
+        return {"a": np.arange(3.0) + len(calls)}
+
+    first = kept(("a",), found, np.ones(2), 3)
+    assert kept(("a",), found, np.ones(2), 3)["a"].tolist() == first["a"].tolist() and len(calls) == 1
+    for other in ((np.ones(2), 4), (np.ones(2, np.float32), 3), (np.ones((2, 1)), 3), ([np.ones(2)], 3)):
+        kept(("a",), found, *other)
+    assert len(calls) == 5
+    (file, *_) = folder_of_programs.iterdir()
+    for file in folder_of_programs.iterdir():
+        file.write_bytes(file.read_bytes()[:50])
+    assert kept(("a",), found, np.ones(2), 3)["a"].tolist() == [6, 7, 8]  # a damaged file is made again
+    assert kept(("a",), lambda: None, np.zeros(1)) is None
+    assert len(list(folder_of_programs.iterdir())) == 5
+
+
+VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "TF_CPP_MIN_LOG_LEVEL")
+
+
+def test_commands_keep_programs_in_a_folder_of_bounded_size(tmp_path, monkeypatch):
+    for name in VARIABLES:
+        monkeypatch.setenv(name, "")  # so that what the function sets goes again
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(parser, "KEPT", 25)
+    (tmp_path / "ncs-jax").mkdir()
+    for age, name in enumerate("abcd"):
+        (tmp_path / "ncs-jax" / name).write_bytes(bytes(10))
+        os.utime(tmp_path / "ncs-jax" / name, (1000 - age, 1000 - age))
+    parser._keep_compiled_programs()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "ncs-jax")
+    assert sorted(os.listdir(tmp_path / "ncs-jax")) == ["a", "b"]
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "ncs-jax" / "a"))  # a file: no folder can be made in it
+    parser._keep_compiled_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
