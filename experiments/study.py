@@ -65,6 +65,20 @@ def changed(scene: Scene, **tables: dict) -> Scene:
     return scene_from(merged(scene.to_dict(), tables), source=scene.source)
 
 
+QUICK: dict[str, dict] = {
+    "network": {"static": (16, 16), "joint": (8,), "dynamic": (16,), "decoder": (16,), "modes": 8, "vibrations": 4},
+    "training": {"batch": 4, "window": 5},
+    "simulation": {"solver": "quasi_newton", "precision": "single", "iterations": 5},
+}  # the smallest that runs every line; its numbers mean nothing
+FEW = 16  # frames of every motion
+QUICK_STEPS = 20
+
+
+def quickened(scene: Scene) -> Scene:
+    """The scene with a few frames of every motion, the smallest network and a simulation that stops early."""
+    return changed(scene, motion={"frames": (0, FEW), "mirror": False}, **QUICK)
+
+
 def stem(motion: str) -> str:
     """The name of a motion alone."""
     return Path(motion.removeprefix("ncs:")).stem
@@ -205,6 +219,8 @@ def abreast(jobs: Sequence[Sequence[Any]]) -> list:
     """
     cores = sorted(os.sched_getaffinity(0))
     halves: SimpleQueue = SimpleQueue()
+    ended: list[float] = []
+    began = time.monotonic()
     for half in (cores[::2], cores[1::2]):
         halves.put(half or cores)
 
@@ -214,6 +230,9 @@ def abreast(jobs: Sequence[Sequence[Any]]) -> list:
             return apart(on_cores, half, *job)
         finally:
             halves.put(half)
+            ended.append(time.monotonic() - began)
+            told = f"{len(ended)} of {len(jobs)} done ({job[0].__name__}), {ended[-1]:.0f} s"
+            print(told, file=sys.stderr, flush=True)
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(one, jobs))
@@ -258,14 +277,17 @@ def command(name: str, doc: str | None, experiment: Callable, arguments: Sequenc
     parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
     parser.add_argument("--steps", type=int, default=2000, help="of training, for every network (default: 2000)")
     parser.add_argument("--unseen", nargs="+", default=UNSEEN, metavar="MOTION", help="what none is trained on")
-    parser.add_argument("--quick", action="store_true", help="20 steps, to try it out: the numbers mean nothing")
+    parser.add_argument("--quick", action="store_true", help="to try it out, smallest: the numbers mean nothing")
     parser.add_argument("--out", default=f"runs/{name}", help=f"folder for the table and the picture (default: runs/{name})")
     parser.add_argument("--kept", type=Path, default=KEPT, help=f"folder of simulations and trained networks (default: {KEPT})")
     o = parser.parse_args(arguments)
     keep_programs(o.kept)
     try:
         scene = load_scene(o.scene)
-        experiment(scene, standing(scene, o.unseen, o.kept), 20 if o.quick else o.steps, Path(o.out), o.kept)
+        if o.quick:
+            scene, o.steps, o.unseen = quickened(scene), QUICK_STEPS, o.unseen[:1]
+        print(f"{name}: {o.steps} steps of each network; what is simulated and trained is kept in {o.kept}", file=sys.stderr)
+        experiment(scene, standing(scene, o.unseen, o.kept), o.steps, Path(o.out), o.kept)
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

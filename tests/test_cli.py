@@ -7,6 +7,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from ncs_jax import io
 from ncs_jax.cli import check, main
+from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.runs.run import load_run
@@ -256,7 +259,7 @@ def test_hosts_that_cannot_be_joined(capsys):
     one_line(capsys, ["--hosts", "in use", "free port"])
 
 
-COMMANDS = ("demo", "train", "animate", "export", "simulate", "evaluate", "view", "body", "fit", "check")
+COMMANDS = ("demo", "train", "preview", "animate", "export", "simulate", "evaluate", "view", "body", "fit", "check")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -362,12 +365,75 @@ def test_train_says_where_it_is(run_folder, tmp_path, capsys):
     scene, _ = run_folder
     assert main(["train", str(scene), "--out", str(tmp_path / "run"), "--steps", "20", "--seed", "3"]) == 0
     text = capsys.readouterr().out
-    for word in ("step 20/20", "membrane", "strain", "penetrating", "validation"):
-        assert word in text
+    last = "step 20: validation total [0-9.]+ J, strain [0-9.]+ %, penetrating [0-9.]+ %"
+    assert re.search(last, text) and len(re.findall(r"step 20/20  total [0-9.]+ J \(bending .*membrane .*strain", text)) == 1
+    assert text.startswith("reading the scene")
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
     assert facts["steps"] == 20 and facts["seed"] == 3 and "jax" in facts["versions"]
     assert any((tmp_path / "run" / "tensorboard").iterdir())
     assert main(["train", str(scene), "--out", str(tmp_path / "run")]) == 2
+
+
+def test_resume_drops_no_option(run_folder, tmp_path, capsys):
+    scene, given = run_folder
+    out = tmp_path / "run"
+    shutil.copytree(given, out)
+    line = ["train", str(scene), "--out", str(out), "--resume"]
+    for option, word in (("--preset", "fast"), ("--seed", "7"), ("--steps", "5"), ("--from", str(given))):
+        assert main([*line, option, word]) == 2
+        one_line(capsys, [option.strip("-").replace("from", "start")])
+    assert main([*line, "--steps", "10"]) == 0
+    assert f"{out} has its 10 steps already: nothing was trained" in capsys.readouterr().out
+    assert main([*line, "--minutes", "0.001"]) == 0
+    said = capsys.readouterr()
+    assert "step 20/20" in said.out
+    first, last = said.err.strip().splitlines()
+    assert first.startswith(
+        "ncs: warning: 0.001 minutes hold about 10 steps on this machine, up to step 20: too few to learn from"
+    )
+    assert last.startswith("ncs: warning: only 20 steps fitted in") and "--resume --minutes M goes on" in last
+    with pytest.raises(SystemExit):
+        main([*line, "--minutes", "1", "--steps", "30"])
+
+
+def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, monkeypatch):
+    """Its pictures, and what they show, are looked at in `test_viewer` and `test_pictures`."""
+    _, folder = run_folder
+    monkeypatch.setattr("ncs_jax.view.pictures.render", lambda *_, **__: np.zeros((520, 400, 3), np.uint8))
+    shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
+    out = tmp_path / "drawn"
+    assert main(["preview", str(folder), "--motion", str(tmp_path / "other.npz"), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    written = [Path(line.strip()).name for line in text.splitlines() if line.startswith(f"  {out}")]
+    assert written == ["preview.png", "preview.html", "preview.gif", "energies.png"]
+    assert re.search(r"other.npz, which it never trained on:\n  mean strain [0-9.]+ %, penetrating vertices", text)
+    page = (out / "preview.html").read_text()
+    assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
+
+
+def test_progress_in_a_terminal_of_80_columns_is_whole():
+    console = Console(file=StringIO(), force_terminal=True, width=80, height=30, legacy_windows=False, _environ={})
+    parts = " ".join(f"{name} 1.23e-05" for name in ("bending", "collision", "gravity", "hold", "membrane", "inertia"))
+    with WorkProgress("reading the scene", console=console) as progress:
+        progress.say("step 200: validation total 1.3 J, strain 4.7 %, penetrating 0.3 % of vertices, and more than a line")
+        progress.show("step 200/5000", 200, 5000, f"total 1.2753 J ({parts})", "strain 2.7 %", left=3725)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", console.file.getvalue())
+    lines = [line.strip() for line in re.split(r"[\r\n]+", text)]
+    bar = next(line for line in lines if line.startswith("step 200/5000, 1:02:05 left"))
+    assert bar.endswith("4% 0:00:00") and len(bar) <= 80
+    assert re.sub(r"\s+", " ", text).count(f"total 1.2753 J ({parts}) strain 2.7 %") == 1  # words are not cut
+
+
+def test_progress_in_a_file_is_lines_as_time_goes_by(monkeypatch):
+    console, now = Console(file=StringIO(), width=80), [0.0]
+    monkeypatch.setattr("ncs_jax.cli.progress.time.monotonic", lambda: now[0])
+    with WorkProgress("reading", console=console) as progress:
+        for frame in range(1, 25):
+            now[0] += 3.0
+            progress.show(f"frame {frame}/24", frame, 24, "x" * 100, left=None)
+    lines = console.file.getvalue().splitlines()
+    told = [int(re.match(r"frame (\d+)/24  x{100}$", line)[1]) for line in lines[1:]]
+    assert lines[0] == "reading ..." and told == [1, 5, 9, 13, 17, 21, 24]
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])
@@ -482,6 +548,11 @@ def test_export_says_what_it_wrote_and_how_far_it_is(run_folder, tmp_path, capsy
     one_line(capsys, ["--rank", "1000"])
     assert main(["export", str(folder), "--out", str(out), "--opset", "3"]) == 2
     one_line(capsys, ["--opset", "13 to 21", "3"])
+    assert main(["export", str(folder), "--out", str(tmp_path / "a.foo")]) == 2
+    one_line(capsys, ["a.foo", ".onnx"])
+    assert main(["export", str(folder), "--out", str(tmp_path / "a.stablehlo")]) == 2
+    one_line(capsys, ["a.stablehlo", "--format stablehlo"])
+    assert not list(tmp_path.glob("a.*"))
 
 
 def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, monkeypatch):

@@ -1,5 +1,6 @@
 """The documentation builds without a warning, and everything in it that a reader might copy is accepted."""
 
+import html
 import importlib
 import re
 import subprocess
@@ -35,6 +36,13 @@ def test_the_documentation_builds(tmp_path):
     theory = (tmp_path / "theory.html").read_text()
     assert theory.count("<math") > 30 and "arithmatex" not in theory
     assert (tmp_path / "study.html").exists() and (tmp_path / "results" / "stability_energies.png").exists()
+    terms = re.sub("<[^>]+>", "", (tmp_path / "api" / "terms.html").read_text().replace("<li>", "* "))
+    items = [html.unescape(line) for line in terms.splitlines()]
+    for item in (
+        "* surface (Surface | None): the touchable body",
+        "* garment (Garment), material (Material): what is constant.",
+    ):
+        assert sum(line.startswith(item) for line in items) == 1, item
     for page in tmp_path.rglob("*.html"):
         text = page.read_text()
         assert 'src="http' not in text, page

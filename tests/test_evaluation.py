@@ -1,10 +1,15 @@
 """Evaluation: quantities of animations whose answers are known."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import ncs_jax
+from ncs_jax import InputError
 from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.pairs import groups_from
 from ncs_jax.energies.contact.surface import surface_from
@@ -13,7 +18,7 @@ from ncs_jax.prepare.build import features_from_records
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene, scene_from
 
-from .scenes import write_scene
+from .scenes import SCENE, grid, write_scene
 from .shapes import ball, tube
 
 
@@ -172,3 +177,27 @@ def test_summary():
     rows = {"total": np.array([1.0, 3.0]), "depth_max": np.array([1.0, 5.0]), "out_of_balance": np.array([1.0, 2.0, 90.0])}
     assert summarise(rows) == {"total": 2.0, "depth_max": 5.0, "out_of_balance": 2.0}
     assert isinstance(jax.tree.leaves(summarise(rows))[0], float)
+
+
+def test_a_frames_inputs_give_what_a_motion_is_measured_with(tmp_path, plain_jax):
+    """With friction; the example of the page runs as it stands, of this scene."""
+    page = (Path(__file__).parents[1] / "docs" / "api" / "terms.md").read_text()
+    block = re.search(r"```python\n(.*?)```", page, re.DOTALL)[1]
+    scene = write_scene(tmp_path, SCENE + "[physics.collision]\nfriction = 0.5\n")
+    vertices, faces = grid(origin=(0.0, 0.3, 0.082))  # so near that it touches
+    np.savez(tmp_path / "cloth.npz", vertices=vertices, faces=faces)
+    found: dict = {}
+    exec(block.replace("ncs:tshirt", str(scene)), found)
+    model, track, step = found["model"], found["track"], found["step"]
+    assert step.advected is not None
+    assert model.terms.collision and model.terms.friction and model.terms.inertia
+    shapes = jnp.stack([found["skinned"](t) for t in range(13)]).at[12, :, 0].add(0.002)  # it slides
+    part = jax.tree.map(lambda a: a[:13], track)
+    rows = measure(model, part.absolute(shapes), part, exact=False)
+    assert rows["friction"][12] > 0
+    for name, value in found["energies"](shapes[12]).items():
+        np.testing.assert_allclose(value, rows[name][12], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found["of_each"][0], sum(found["parts"].values()), rtol=1e-6)
+    assert np.ptp(found["of_each"]) > 0 and np.isfinite(found["force"]).all()
+    with pytest.raises(InputError, match=r"previous: .*the garment in the frame before"):
+        ncs_jax.frame_inputs(model, track, 12)

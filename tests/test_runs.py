@@ -8,22 +8,25 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.rollout import stepper
+from ncs_jax.runs.begin import assemble_run
 from ncs_jax.runs.checkpoint import Checkpoints, write_run
-from ncs_jax.runs.run import load_run
+from ncs_jax.runs.plan import EARLY, Costs, steps_within
+from ncs_jax.runs.run import Run, assemble, load_run
 from ncs_jax.runs.train import train
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.devices import free_memory
 from ncs_jax.training.step import initial_state
 
-from .scenes import FREE, write_scene
+from .scenes import FREE, grid, swing, write_scene
 
 STEPS = 60
 SOURCE = Path(__file__).parents[1] / "src"
@@ -197,13 +200,120 @@ def test_killed_before_anything_was_prepared_a_run_goes_on(tmp_path, plain_jax):
     assert load_run(out).steps == 10
 
 
-def test_minutes_choose_the_steps(tmp_path, plain_jax):
-    scene, seen = write_scene(tmp_path, FREE), []
-    began = time.monotonic()
-    run = train(scene, tmp_path / "run", minutes=0.1, report=seen.append)
-    assert seen[-1].step == seen[-1].steps == run.steps and run.steps % 10 == 0
-    assert time.monotonic() - began < 4 * 15  # an estimate, on a machine that may be doing other things
+def steps_of_log(out):
+    with (out / "log.csv").open() as file:
+        return [int(row["step"]) for row in csv.DictReader(file)]
+
+
+def test_minutes_choose_the_steps_and_too_few_are_warned_of(tmp_path, plain_jax):
+    scene, seen, out = write_scene(tmp_path, FREE), [], tmp_path / "run"
+    with pytest.warns(InputWarning, match=r"0.001 minutes hold about 10 steps .*: too few .*; 300 steps take about \d+ m"):
+        run = train(scene, out, minutes=0.001, report=seen.append)
+    assert [r.step for r in seen] == [10] and run.steps == seen[-1].steps == 10
     assert seen[-1].validation is not None and seen[-1].left == 0
+    with pytest.raises(InputError, match="minutes: either steps or minutes"):
+        train(scene, out, minutes=1, steps=20, resume=True)
+    with pytest.warns(InputWarning, match="10 steps on this machine, up to step 20"):
+        assert train(scene, out, minutes=0.001, resume=True).steps == 20
+    assert steps_of_log(out) == [10, 20]
+
+
+def test_steps_within_a_time_count_everything_that_takes_time():
+    """Beside a count step by step of what `_Loop` does."""
+
+    def seconds(costs, first, last):
+        total = 0.0
+        for done in range(first + 10, last + 1, 10):
+            total += 10 * costs.step + (done % costs.validate_every == 0 or done == last) * costs.validation
+            total += (done % costs.checkpoint_every == 0 or done == last) * costs.checkpoint
+            total += (done % costs.checkpoint_every == 0 or done in EARLY) * costs.lists
+        return total
+
+    quick, slow = Costs(0.01, 3.0, 1.0, 0.2, 200, 150), Costs(10.0, 60.0, 5.0, 1.0, 20, 200)
+    for costs in (quick, slow):
+        for first in (0, 60, 400):
+            for allowed in (1, 100, 600, 3600):
+                last = steps_within(allowed, costs, first)
+                assert last % 10 == 0 and last > first
+                assert last == first + 10 or 1.05 * seconds(costs, first, last) <= allowed
+                assert 1.05 * seconds(costs, first, last + 10) > allowed - 4 - (costs is slow) * 66
+    assert steps_within(180, slow) == 10 and steps_within(180, quick) > 10_000 / 2
+
+
+def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):
+    scene, out, rates = write_scene(tmp_path, FREE), tmp_path / "run", []
+    train(scene, out, steps=20)
+    before = leaves(out)
+    run = train(scene, out, steps=40, resume=True, report=rates.append)
+    assert run.steps == load_run(out).steps == 40 and steps_of_log(out) == [10, 20, 30, 40]
+    assert [r.steps for r in rates] == [40, 40]
+    assert not any(np.array_equal(a, b) for a, b in zip(before, leaves(out), strict=True) if a.any())
+    # The rate is that of a run of 40 steps: had the one of 20 been kept, it would be 2 % of the full one.
+    moved = max(float(np.abs(a - b).max()) for a, b in zip(before, leaves(out), strict=True))
+    assert moved > 3 * 0.02 * 1e-3 * 20
+    assert train(scene, out, steps=40, resume=True, report=pytest.fail).steps == 40
+    with pytest.raises(InputError, match=r"steps: at least the 40 steps .*found 30"):
+        train(scene, out, steps=30, resume=True)
+    with pytest.raises(InputError, match=r"a run keeps its seed .*found 5"):
+        train(scene, out, seed=5, resume=True)
+    scene.write_text(scene.read_text().replace("steps = 40", "steps = 40\nlearning_rate = 0.01"))
+    with pytest.warns(InputWarning, match=r"not taken: training.learning_rate; .*--from"):
+        train(scene, out, resume=True)
+
+
+@pytest.fixture(scope="module")
+def unstarted(tmp_path_factory):
+    """A run to begin others from."""
+    folder = tmp_path_factory.mktemp("first")
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        train(write_scene(folder, FREE), folder / "first", steps=10)
+    return folder / "first"
+
+
+def test_a_run_begins_with_the_weights_of_another(unstarted, tmp_path, plain_jax):
+    scene, begun = write_scene(tmp_path, FREE), load_run(unstarted)
+    moving = swing()
+    moving["poses"][:, 1] = 0  # the upper joint does not turn; yet the run goes on to read it
+    np.savez(tmp_path / "walk.npz", **moving)
+    text = scene.read_text()
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace('files = ["swing.npz"]', 'files = ["walk.npz"]') + "[physics]\ndensity = 0.2\n")
+    out = tmp_path / "second"
+    run = train(other, out, steps=10, start=begun)
+    kept = Checkpoints(out)
+    assert kept.latest() == 10 and load_run(out).assembly.prepared.inputs.tolist() == begun.assembly.prepared.inputs.tolist()
+    # A step of Adam is at most its rate: ten of them lead at most so far from where the run began.
+    apart = [
+        float(np.abs(a - b).max()) for a, b in zip(jax.tree.leaves(begun.params), jax.tree.leaves(run.params), strict=True)
+    ]
+    assert 0 < max(apart) <= 10 * 1.1e-3
+    assert train(other, out, steps=20, resume=True).steps == 20
+    assert np.isfinite(begun.animate(str(tmp_path / "swing.npz"))).all()
+
+
+def test_joints_that_turn_and_are_not_read_are_warned_of(tmp_path, plain_jax):
+    scene = load_scene(write_scene(tmp_path, FREE))
+    one = assemble(replace(scene, body=replace(scene.body, joints=("0",))))
+    begun = Run(one, initial_state(one.model, one.network, 0).params)
+    with pytest.warns(InputWarning, match="does not read joints that turn in the motions: 1;"):
+        found, _ = assemble_run(scene, None, None, begun, terms=(), network=None)
+    assert found.prepared.inputs.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("decoder = [16]", "decoder = [32]", r"network.decoder: the network of .*first expected, \(16,\) .*decoder = \[16\]"),
+        ('file = "cloth.npz"', 'file = "other.npz"', "garment.file: the triangles of the garment of .*first expected, 40"),
+    ],
+)
+def test_weights_of_another_network_or_garment_are_refused(unstarted, tmp_path, plain_jax, old, new, match):
+    scene = write_scene(tmp_path, FREE.replace(old, new))
+    vertices, faces = grid(rows=5)
+    np.savez(tmp_path / "other.npz", vertices=vertices, faces=faces)
+    with pytest.raises(InputError, match=match):
+        train(scene, tmp_path / "run", steps=10, start=unstarted)
+    assert not (tmp_path / "run").exists()
 
 
 def test_what_does_not_fit_into_memory_is_said_before_anything_is_written(tmp_path, plain_jax, monkeypatch):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ncs_jax.runs.train import train
     from ncs_jax.scene.model import Model, local_rotations
     from ncs_jax.scene.spec import Scene, load_scene, scene_from
+    from ncs_jax.scene.step_inputs import frame_inputs
 
     Frame = StepInputs
 
@@ -37,6 +38,7 @@ __all__ = [
     "animate",
     "assemble",
     "energies",
+    "frame_inputs",
     "load_run",
     "load_scene",
     "local_rotations",
@@ -63,6 +65,7 @@ _HOMES = {
     "runs.train": ("train",),
     "scene.model": ("Model", "local_rotations"),
     "scene.spec": ("Scene", "load_scene", "scene_from"),
+    "scene.step_inputs": ("frame_inputs",),
 }
 _HOME = {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
 _OLD = {"Frame": "StepInputs"}  # names until version 0.1

@@ -1,4 +1,4 @@
-"""The one error that a user's input can cause, and the check that what is asked for was given."""
+"""The one error and the one warning that a user's input can cause, and the check that what is asked for was given."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-__all__ = ["InputError", "required"]
+__all__ = ["InputError", "InputWarning", "required"]
 
 
 class InputError(ValueError):
@@ -31,6 +31,10 @@ class InputError(ValueError):
         found = "" if value is None else f" (found {_short(value)})"
         text = f"{where}: {expected}{found}" if where else f"{expected}{found}"
         super().__init__(f"{text}; {mend}" if mend else text)
+
+
+class InputWarning(UserWarning):
+    """What a user gave can be used, but may not do what was meant. The commands print it as a line on stderr and go on."""
 
 
 def required(value: T | None, field: str, mend: str | None = None) -> T:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
 
@@ -45,8 +47,10 @@ def animate(options) -> int:
     import numpy as np
 
     from ncs_jax import io
+    from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs.run import load_run
 
+    animation_suffix(options.out)  # before the run is read
     run = load_run(options.folder)
     motions = (options.motion,) if options.motion else run.assembly.scene.motions
     if not motions:
@@ -73,8 +77,10 @@ def animate(options) -> int:
 
 def export(options) -> int:
     """Write one step of a trained garment as a file, and print how it was checked."""
+    from ncs_jax.export.facts import FileFormat
     from ncs_jax.runs.run import load_run
 
+    FileFormat(options.format).check_name(Path(options.out))  # before the run is read
     chosen = {name: getattr(options, name) for name in ("format", "rank", "float16", "opset", "motion")}
     print(load_run(options.folder).export(options.out, **chosen))
     return 0

@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, animate, export, simulate, evaluate, view, body, fit, check."""
+"""The command line: ncs demo, train, preview, animate, export, simulate, evaluate, view, body, fit, check."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import contextlib
 import gc
 import os
 import sys
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
-from ncs_jax.cli import animate, body, check, evaluate, fit, simulate, train, view
-from ncs_jax.errors import InputError
+from ncs_jax.cli import animate, body, check, evaluate, fit, preview, simulate, train, view
+from ncs_jax.errors import InputError, InputWarning
 
 __all__ = ["main"]
 
@@ -20,6 +21,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
 
   ncs demo                          train the packaged T-shirt and write a preview to look at
   ncs train SCENE --out RUN         train the garment of a scene file (ncs:demo, ncs:tshirt and ncs:skirt are packaged)
+  ncs preview RUN                   draw it again: a picture, a page that plays it, a GIF
   ncs animate RUN --out FILE        animate a trained garment
   ncs export RUN --out FILE         write its step for a game engine or another host, as ONNX or StableHLO
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
@@ -49,7 +51,10 @@ def main(arguments: list[str] | None = None) -> int:
         gc.freeze()
         gc.set_threshold(10_000, 20, 50)
     try:
-        return parsed.run(parsed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", InputWarning)
+            warnings.showwarning = _show_warning
+            return parsed.run(parsed)
     except InputError as error:
         print(f"ncs: {error}", file=sys.stderr)
         code = 2
@@ -61,11 +66,18 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """Print what a user's input may have done wrong as one line, and any other warning as Python does."""
+    told = issubclass(category, InputWarning)
+    text = f"ncs: warning: {message}\n" if told else warnings.formatwarning(message, category, filename, lineno, line)
+    (file or sys.stderr).write(text)
+
+
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="ncs", description=DESCRIPTION, formatter_class=raw)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (train, animate, simulate, evaluate, body, fit, view, check):
+    for group in (train, preview, animate, simulate, evaluate, body, fit, view, check):
         group.add_commands(commands)
     return parser
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ncs_jax.cli import arguments
-from ncs_jax.cli.clock import clock
+from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.scene.spec import load_scene
 
 __all__ = ["add_commands", "simulate"]
@@ -31,8 +31,6 @@ def simulate(options) -> int:
     scene = load_scene(options.scene)  # before JAX is imported, which takes a second
 
     import numpy as np
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ncs_jax import io
     from ncs_jax.io.animation.animation import animation_suffix
@@ -40,16 +38,14 @@ def simulate(options) -> int:
 
     animation_suffix(options.out)  # before hours are spent on frames that cannot be written
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
-    console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("reading the scene and compiling", total=None)
+    with WorkProgress("reading the scene") as progress:
 
         def show(p):
-            text = f"frame {p.frame}/{p.frames}  {p.iterations} iterations  {p.residual:.3g} g  {clock(p.left)} left"
-            progress.update(task, total=p.frames, completed=p.frame, description=text)
-            if not console.is_terminal and (p.frame % 30 == 0 or p.frame == p.frames):
-                print(text, flush=True)
+            if p.begins:
+                progress.say(f"compiling, then frame {p.frame + 1} of {p.frames}")
+                return
+            how = f"{p.iterations} iterations, {p.residual:.3g} g out of balance"
+            progress.show(f"frame {p.frame}/{p.frames}", p.frame, p.frames, how, left=p.left)
 
         result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment

@@ -7,29 +7,36 @@ import sys
 from pathlib import Path
 
 from ncs_jax.cli import arguments
-from ncs_jax.cli.clock import clock
+from ncs_jax.cli.preview import draw
+from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.errors import InputError
 from ncs_jax.runs.log import Report
 from ncs_jax.scene.spec import PRESETS, load_scene
 
 __all__ = ["add_commands", "demo", "leave", "train"]
 
+DEMO_MINUTES = 3.0
+
 
 def add_commands(commands) -> None:
     """Declare the options."""
     parser = arguments.command(commands, "demo", demo, "train the packaged T-shirt and write pictures and a page that plays it")
     parser.add_argument("--out", default="runs/demo", help="run folder (default: runs/demo)")
-    parser.add_argument("--minutes", type=arguments.positive, default=3.0, help="minutes of training (default: 3)")
+    parser.add_argument("--minutes", type=arguments.positive, help="minutes of training, from the first step on (default: 3)")
     parser.add_argument("--scene", default="ncs:demo", help="another scene file")
 
     parser = arguments.command(commands, "train", train, "train the garment of a scene file from the physics energy alone")
     parser.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
     parser.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints and logs")
-    parser.add_argument("--steps", type=arguments.whole, help="optimiser steps (default: the scene's)")
-    parser.add_argument("--minutes", type=arguments.positive, help="train for about this long instead of a number of steps")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=arguments.whole, help="optimiser steps in all (default: the scene's)")
+    length.add_argument(
+        "--minutes", type=arguments.positive, metavar="M", help="as many steps as fit into M minutes, from the first step on"
+    )
     parser.add_argument("--seed", type=arguments.seed, help="seed (default: the scene's)")
     parser.add_argument("--preset", choices=PRESETS, help="speed for accuracy: sizes of the network (default: the scene's)")
-    parser.add_argument("--resume", action="store_true", help="go on with the run in --out from its last checkpoint")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in --out: to --steps, or --minutes more")
+    parser.add_argument("--from", dest="start", metavar="RUN", help="begin with the weights of another run of this garment")
     parser.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
     parser.add_argument(
         "--hosts", type=arguments.hosts, metavar="HOST:PORT,COUNT,RANK",
@@ -46,14 +53,11 @@ def train(options) -> int:
 
     import jax
 
-    from ncs_jax.runs import train as runs_train
-
     if options.hosts is not None:
         _join(options.hosts)
+    chosen = {name: getattr(options, name) for name in ("steps", "minutes", "seed", "resume", "start")}
     try:
-        chosen = {name: getattr(options, name) for name in ("steps", "minutes", "seed", "resume")}
-        with _TrainingBar() as bar:
-            run = runs_train.train(scene, options.out, **chosen, report=bar.show)
+        run = _trained(scene, options.out, **chosen)
     except jax.errors.JaxRuntimeError as error:
         if options.hosts is None:
             raise
@@ -62,82 +66,80 @@ def train(options) -> int:
         raise InputError(f"training with the other hosts broke off: {reason}", field="--hosts", mend=mend) from error
     if options.hosts is not None:
         jax.distributed.shutdown()  # the others need not wait for the pictures
-    if options.preview and jax.process_index() == 0:
-        _previews(run, options.out)
+    if jax.process_index() == 0:
+        if options.preview:
+            draw(run, options.out)
+        _warn_of_few_steps(run, options.minutes, f"ncs train {options.scene} --out {options.out} --resume --minutes M goes on")
     return 0
 
 
 def demo(options) -> int:
-    """Train the packaged T-shirt, draw it and print how it does on a motion that it never saw."""
-    out, scene = Path(options.out), load_scene(options.scene)
-
-    from ncs_jax.runs import train as runs_train
-
+    """Train the packaged T-shirt, draw it and print how it does on a motion that it never saw; a demo that is there goes on."""
+    out = Path(options.out)
     resume = (out / "run.json").exists()
-    with _TrainingBar() as bar:
-        run = runs_train.train(scene, out, minutes=options.minutes, resume=resume, report=bar.show)
-    quantities = _previews(run, out)
-    motion = run.assembly.scene.motion.validation
-    print(f"On {motion[0]}, which it never trained on:" if motion else "On its motion:")
-    inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
-    print(f"  mean strain {quantities['strain_mean']:.2f} %{inside}")
+    minutes = options.minutes if options.minutes or resume else DEMO_MINUTES
+    run = _trained(load_scene(options.scene), out, minutes=minutes, resume=resume)
+    draw(run, out)
+    _warn_of_few_steps(run, minutes, f"ncs demo --out {out} --minutes M goes on")
     return 0
 
 
-def _previews(run, out) -> dict[str, float]:
-    """Draw the run into its folder, print which files there are, and return how it does on its motion."""
-    from ncs_jax.view.preview import preview
+def _trained(scene, out, **chosen):
+    """Train with a bar, and say so where a run has all its steps already."""
+    import jax
 
-    print("drawing the preview ...", flush=True)
-    quantities = preview(run, out)
-    for name in ("preview.png", "preview.gif", "preview.html", "energies.png"):
-        if (Path(out) / name).exists():
-            print(f"  {Path(out) / name}")
-    return quantities
+    from ncs_jax.runs import train as runs_train
+
+    with _TrainingBar() as bar:
+        run = runs_train.train(scene, out, **chosen, report=bar.show)
+    if not bar.reports and jax.process_index() == 0:
+        print(f"{out} has its {run.steps} steps already: nothing was trained; --steps N, or --minutes M, goes on")
+    return run
+
+
+def _warn_of_few_steps(run, minutes: float | None, mend: str) -> None:
+    """Say, at the very end, that a training by the clock was too short to be looked at."""
+    from ncs_jax.runs.plan import ENOUGH
+
+    if minutes is not None and run.steps < ENOUGH:
+        what = f"only {run.steps} steps fitted in, too few to learn from: what was written shows no trained garment"
+        print(f"ncs: warning: {what}; {mend}", file=sys.stderr)
 
 
 class _TrainingBar:
-    """A bar that says how training goes; lines instead where the output is no terminal. Only the first process shows it."""
+    """Say how training goes. Only the first process does."""
 
     def __init__(self) -> None:
         import jax
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._console = Console(quiet=jax.process_index() > 0)
-        percent = TextColumn("{task.percentage:>3.0f}%")
-        columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), percent, TimeElapsedColumn())
-        self._progress = Progress(*columns, console=self._console, transient=False)
-        self._task = self._progress.add_task("reading the scene and compiling", total=None)
+        self._progress = WorkProgress("reading the scene and compiling", quiet=jax.process_index() > 0)
         self._devices = jax.device_count()
+        self.reports = 0
 
     def __enter__(self) -> _TrainingBar:
-        self._progress.start()
+        self._progress.__enter__()
         return self
 
-    def __exit__(self, *_) -> None:
-        self._progress.stop()
+    def __exit__(self, *error) -> None:
+        self._progress.__exit__(*error)
 
     def show(self, r: Report) -> None:
         """Show a report."""
-        if self._devices > 1 and self._progress.tasks[0].total is None:  # the first report
+        if self._devices > 1 and not self.reports:
             fewer = "" if r.devices == self._devices else ": no more of them divide training.batch"
-            self._progress.print(f"training on {r.devices} of {self._devices} devices{fewer}")
-        total = sum(r.energies.values())
-        parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
-        moved = "" if r.moved is None else f"  alpha moves {r.moved:.1f} mm"
-        dropped = f"  dropped {r.dropped}" if r.dropped else ""
-        text = f"step {r.step}/{r.steps}  [bold]{total:.4f} J[/bold]  ({parts})\n"
-        text += f"strain {r.strain:.1f} %  penetrating {r.penetrating:.1f} %  {clock(r.left)} left{moved}{dropped}"
-        self._progress.update(self._task, total=r.steps, completed=r.step, description=text)
+            self._progress.say(f"training on {r.devices} of {self._devices} devices{fewer}")
+        self.reports += 1
         if r.message:
-            self._progress.print(r.message)
+            self._progress.say(f"step {r.step}: {r.message}")
+        parts = " ".join(f"{name} {value:.3g}" for name, value in r.energies.items())
+        energy = f"total {sum(r.energies.values()):.4f} J ({parts})"
+        garment = f"strain {r.strain:.1f} %, penetrating {r.penetrating:.1f} %"
+        garment += "" if r.moved is None else f", alpha moves {r.moved:.1f} mm"
+        garment += f", {r.dropped} steps dropped" if r.dropped else ""
+        self._progress.show(f"step {r.step}/{r.steps}", r.step, r.steps, energy, garment, left=r.left or None)
         if r.validation:
-            words = ", ".join(f"{k} {v:.4g}" for k, v in r.validation.items())
-            self._progress.print(f"step {r.step}: validation {words}")
-        if not self._console.is_terminal and (r.step % 100 == 0 or r.step == r.steps):
-            where = f"step {r.step}/{r.steps} total {total:.4f} {parts} strain {r.strain:.1f} %"
-            print(f"{where} penetrating {r.penetrating:.1f} % {clock(r.left)} left", flush=True)
+            units = {"total": "total {:.4g} J", "strain_mean": "strain {:.3g} %", "penetrating": "penetrating {:.3g} %"}
+            self._progress.say(f"step {r.step}: validation " + ", ".join(units[k].format(v) for k, v in r.validation.items()))
 
 
 def _join(hosts: dict) -> None:

@@ -17,7 +17,7 @@ from ncs_jax.prepare.build import Assembly
 
 __all__ = ["FORMATS", "FileFormat", "host_facts"]
 
-FORMATS = ("onnx", "stablehlo")
+FORMATS = {"onnx": (".onnx",), "stablehlo": ("", ".stablehlo")}  # and how a file's name may end
 INTERFACE = 1  # of the step and the facts: a change that breaks a host gives the next number
 
 
@@ -41,6 +41,14 @@ class FileFormat:
         """Check the name."""
         if self.name not in FORMATS:
             raise InputError(f"one of {', '.join(FORMATS)} expected", field="--format", value=self.name)
+
+    def check_name(self, file: Path) -> None:
+        """Raise an InputError where a file's name ends otherwise than this format's do."""
+        endings, found = FORMATS[self.name], file.suffix.lower()
+        if found not in endings:
+            other = next((name for name, theirs in FORMATS.items() if found in theirs), None)
+            mend = f"add --format {other}" if other else f"end the name in {endings[-1]}"
+            raise InputError(f"a name in {endings[-1]} expected for {self.name}", file=file, value=found, mend=mend)
 
 
 def host_facts(assembly: Assembly, step: Step, file: Path, format: FileFormat) -> dict:

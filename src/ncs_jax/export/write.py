@@ -70,6 +70,7 @@ def export(
         InputError: the format's package is missing, the network does what ONNX cannot, or the place is unwritable.
     """
     file, model, format = Path(file), assembly.model, format or FileFormat()
+    format.check_name(file)
     network, params = for_inference(assembly.network, params, model)
     if format.float16:
         params = rounded(params)

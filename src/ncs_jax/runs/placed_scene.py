@@ -48,9 +48,10 @@ class PlacedScene:
         """Return how many devices train."""
         return 1 if self.mesh is None else self.mesh.size
 
-    def initial_state(self) -> TrainState:
-        """Return the state that the seed gives, in this process alone."""
-        return initial_state(self.model, self.assembly.network, self.seed)
+    def initial_state(self, params: dict | None = None) -> TrainState:
+        """Return the state that the seed gives, with parameters of another run if there are any, in this process alone."""
+        state = initial_state(self.model, self.assembly.network, self.seed)
+        return state if params is None else replace(state, params=params)
 
     def copied(self, tree):
         """Return the first process's arrays on every device."""

@@ -37,7 +37,7 @@ TURN = (0.3, 0.5, 0.7)
 
 @dataclass(frozen=True)
 class Progress:
-    """What a simulation says after every frame."""
+    """What a simulation says after every frame, and as it `begins`, before it compiles."""
 
     frame: int
     frames: int
@@ -45,6 +45,7 @@ class Progress:
     residual: float  # g
     status: int
     left: float  # s
+    begins: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def simulate(
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
             first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
-            after every frame. terms: of one's own, see `energies.terms.OwnTerm`.
+            before the first and after every frame. terms: of one's own, see `energies.terms.OwnTerm`.
 
     Raises:
         InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
@@ -162,6 +163,8 @@ def _simulated(
     rows: dict[str, list] = {key: list(values) for key, values in done.items()}
     begun = saved = time.monotonic()
     first = len(rows["status"])
+    if report is not None and first < frames:
+        report(Progress(first, frames, 0, 0.0, 0, 0.0, begins=True))
     for t in range(first, frames):
         solutions: list[Solution] = []
         started = time.monotonic()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import platform
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -14,13 +17,15 @@ import jax
 import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.metrics.quality import summarise
-from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, write_prepared, write_run
+from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
+from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene
-from ncs_jax.runs.run import NetworkMaker, Run, assemble, check_own, own_names
-from ncs_jax.scene.spec import Scene, load_scene, scene_from
+from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
+from ncs_jax.runs.run import NetworkMaker, Run, own_names
+from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.training.batches import CHUNK, chunks
 from ncs_jax.training.devices import trim_memory
 from ncs_jax.training.step import TrainState
@@ -29,7 +34,6 @@ __all__ = ["train"]
 
 
 IDLE = 0.5  # mm that alpha should make a difference of, at least
-EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
 
 
 def train(
@@ -40,6 +44,7 @@ def train(
     minutes: float | None = None,
     seed: int | None = None,
     resume: bool = False,
+    start: Run | str | Path | None = None,
     report: Callable[[Report], None] | None = None,
     terms: Sequence[OwnTerm] = (),
     network: NetworkMaker | None = None,
@@ -47,62 +52,80 @@ def train(
     """Train a garment from the physics energy alone, on every device that JAX sees.
 
     Args:
-        scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
-        steps: optimiser steps, else the scene's. minutes: instead, as many steps as fit. seed: else the scene's.
-        resume: continue the run in `out`; its steps and seed stand. report: called after every chunk of steps.
+        scene: a scene, or the path of a scene file.
+        out: run folder for checkpoints and logs; None keeps nothing.
+        steps: optimiser steps in all, else the scene's.
+        minutes: instead, as many steps as fit, from the first step on; fewer than 300 in all are warned of.
+        seed: else the scene's.
+        resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned. Its scene and seed stand. The
+            learning rate is that of a run of so many steps from its beginning.
+        start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
+        report: called after every chunk of steps.
         terms: of one's own, see `energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step inputs, in
-            J. network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
+            J.
+        network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
 
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 
     Raises:
-        InputError: the scene or the folder is unusable, or the hosts do not divide the batch.
+        InputError: the scene or the folder is unusable, a run has more steps than it is to have, `start` does not fit, or the
+            hosts do not divide the batch.
     """
     scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
     out = None if out is None else Path(out)
-    facts = _facts(out, resume)
-    if out is not None:
-        if facts is not None:
-            scene, seed = scene_from(facts["scene"], source=str(out / "run.json")), facts["seed"]
-            check_own(facts, out, terms, network)
-        check_writable(out)
-    assembly = assemble(scene, terms=terms, network=network)
+    _check_options(steps, minutes, resume, start)
+    facts = facts_of_run(out, resume)
+    if out is not None and facts is not None:
+        scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
+    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network)
     trim_memory()
-    placed = PlacedScene(assembly, scene.training.seed if seed is None else seed)
+    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
-    state = placed.initial_state()
+    state = placed.initial_state(params)
     placed.refresh(state.params)
     if facts is None:  # before anything is written: whether it fits into memory
         placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps))
-    planned = 0 if facts is None else facts["steps"]
-    with closing(_Output(placed, out, report, {"steps": planned, **own_names(terms, network)})) as output:
-        if planned:
-            steps = planned
-        else:
-            fitting = None if minutes is None else _steps_within(60 * minutes, began, placed, output, state)
-            steps = fitting or steps or scene.training.steps
-            output.plan(steps)
-        state = placed.copied(output.restore(state))
-        return Run(assembly, _Loop(placed, output, state, steps, began).run(), steps)
+        facts = {"steps": 0, **own_names(terms, network)} | ({"start": str(start)} if start else {})
+    with closing(_Output(placed, out, report, facts)) as output:
+        if params is not None:
+            output.save(0, state)  # a run that is killed has these weights no more
+        state = output.restore(state)
+        last = _planned(placed, output, state, steps, minutes)
+        return Run(assembly, _Loop(placed, output, placed.copied(state), last, began).run(), last)
 
 
-def _facts(out: Path | None, resume: bool) -> dict | None:
-    """Return what run.json says of the run to resume, None for a new run."""
-    if out is None or not (out / "run.json").exists():
-        if resume:
-            raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
-        return None
-    if not resume:
-        raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
-    return read_run(out)
+def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
+    """Raise an InputError where two options exclude each other."""
+    if steps is not None and minutes is not None:
+        raise InputError("either steps or minutes expected", field="minutes", value=minutes, mend="leave one of them out")
+    if resume and start is not None:
+        raise InputError("a run that is resumed has weights", field="start", value=str(start), mend="leave it out")
+
+
+def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int | None, minutes: float | None) -> int:
+    """Return at which step a run ends that stands at a state, and write it into run.json."""
+    last = steps or output.planned or placed.assembly.scene.training.steps
+    if minutes is not None:
+        assembly = placed.assembly
+        validate = functools.partial(_validate, Run(assembly, state.params)) if assembly.scene.motion.validation else None
+        costs = measure_costs(placed, state, validate, output.seconds_of_a_checkpoint(state))
+        last = int(placed.copied(steps_within(60 * minutes, costs, int(state.step))))
+        if last < ENOUGH and jax.process_index() == 0:
+            needed = math.ceil(costs.seconds(int(state.step), ENOUGH) / 60)
+            upto = f", up to step {last}" if state.step else ""
+            what = f"{minutes:g} minutes hold about {last - int(state.step)} steps on this machine{upto}: too few to learn from"
+            warnings.warn(f"{what}; {ENOUGH} steps take about {needed} minutes", InputWarning, stacklevel=3)
+    if last != output.planned:
+        output.plan(last)
+    return last
 
 
 class _Output:
     """What a run writes into its folder, if it has one, and what it reports."""
 
     def __init__(self, placed: PlacedScene, out: Path | None, report: Callable[[Report], None] | None, facts: dict):
-        """Open the folder. `facts` of run.json: the steps planned, 0 in a new one; names of what is one's own."""
+        """Open the folder. `facts` of run.json: the steps planned, 0 in a new one; from where it began; what is one's own."""
         self._placed, self._out, self._report, self._facts = placed, out, report, facts
         self._checkpoints: Checkpoints | None = None
         self._log: RunLog | None = None
@@ -119,11 +142,19 @@ class _Output:
             facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
             write_run(self._out, facts)
 
-    def seconds_of_a_first_checkpoint(self, state: TrainState) -> float:
-        """Write the state before the first step, unless there is one, and return how long that took."""
+    @property
+    def planned(self) -> int:
+        """Return how many steps were planned, 0 where none were."""
+        return self._facts["steps"]
+
+    def seconds_of_a_checkpoint(self, state: TrainState) -> float:
+        """Return how long a checkpoint takes: to write the state before the first step, or to read the one that there is."""
         start = time.monotonic()
-        if self._checkpoints is not None and self._checkpoints.latest() is None:
-            self._checkpoints.save(0, state)
+        if self._checkpoints is not None:
+            if self._checkpoints.latest() is None:
+                self._checkpoints.save(0, state)
+            else:
+                self._checkpoints.restore(state)
         return time.monotonic() - start
 
     def restore(self, state: TrainState) -> TrainState:
@@ -162,7 +193,7 @@ class _Loop:
         """`state`: on the devices; it is used up. `began`: when training was called, s."""
         spec = placed.assembly.scene.training
         self._placed, self._output, self._state, self._steps, self._began = placed, output, state, steps, began
-        self._every, self._check = _whole_chunks(spec.checkpoint_every), _whole_chunks(spec.validate_every)
+        self._every, self._check = whole_chunks(spec.checkpoint_every), whole_chunks(spec.validate_every)
         self._first, self._dropped = int(state.step), int(state.dropped)
         # One look alone may see nothing but frames that stand still: these are all looks since the last validation.
         self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
@@ -236,41 +267,6 @@ class _Loop:
             return 0.0
         step, start = self._timed
         return (now - start) / (done - step)
-
-
-def _whole_chunks(steps: int) -> int:
-    """Return the next multiple of CHUNK."""
-    return -(-steps // CHUNK) * CHUNK
-
-
-def _steps_within(seconds: float, began: float, placed: PlacedScene, output: _Output, state: TrainState) -> int:
-    """Return how many steps fit into so many seconds since `began`, by the pace of a few: whole chunks, one at least."""
-    assembly, spec = placed.assembly, placed.assembly.scene.training
-
-    def chunk(state):
-        state, _ = placed.run_chunk(state, 0, CHUNK, CHUNK)
-        placed.measure(placed.local(state.params), CHUNK)
-        return jax.block_until_ready(state)
-
-    def validate(state):
-        _validate(Run(assembly, state.params))
-        return state
-
-    pace = _seconds(chunk, placed.copied(placed.initial_state())) / CHUNK
-    if assembly.scene.motion.validation:
-        pace += _seconds(validate, state) / _whole_chunks(spec.validate_every)
-    pace += output.seconds_of_a_first_checkpoint(state) / _whole_chunks(spec.checkpoint_every)
-    left = seconds - (time.monotonic() - began)
-    steps = max(CHUNK, int(left / (1.05 * pace)) // CHUNK * CHUNK)
-    return int(placed.copied(steps))
-
-
-def _seconds(work: Callable, state) -> float:
-    """Return how long `work(state) -> state` takes once it is compiled."""
-    state = work(state)
-    start = time.monotonic()
-    work(state)
-    return time.monotonic() - start
 
 
 def _validate(run: Run) -> dict[str, float]:

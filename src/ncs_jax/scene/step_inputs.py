@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import contact_force
 from ncs_jax.errors import required
-from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.geometry.skinning import blend, skin, unpose
+from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 
-__all__ = ["Past", "step_inputs"]
+__all__ = ["Past", "frame_inputs", "step_inputs"]
 
 
 class Past(NamedTuple):
@@ -69,6 +70,38 @@ def step_inputs(
         force,
         past.moving if terms.inertia or terms.friction else None,
     )
+
+
+def frame_inputs(
+    model: Model,
+    track: MotionFeatures,
+    frame: int | Int[Array, ""],
+    previous: Float[Array, "verts 3"] | None = None,
+    before: Float[Array, "verts 3"] | None = None,
+) -> StepInputs:
+    """Return what the energies of a frame of a motion read, all that the model's terms ask for.
+
+        step = frame_inputs(model, track, 12, previous, before)
+        parts = energies(x, model.garment, model.material, step, model.terms, model.surface)
+
+    Args:
+        model: of a scene, such as `assembly.model`.
+        track: a motion, `assembly.track` or `run.track(name)`. Positions are seen from its origin: `track.relative(x)`.
+        frame: which of the track's.
+        previous: the garment in the frame before, x_{t-1}, m; needed with inertia or friction.
+        before: the garment two frames before, x_{t-2}, m; else that of the frame before, a garment that was at rest.
+
+    Raises:
+        InputError: a term asks for the past, and there is none.
+    """
+    unposed, terms = None, model.terms
+    if terms.inertia or terms.friction or terms.own:
+        previous = required(previous, "previous", "give the garment in the frame before, seen from track.origin, m")
+        before = previous if before is None else before
+    if terms.friction:
+        last = jnp.maximum(jnp.asarray(frame) - 1, track.start[frame])
+        unposed = unpose(blend(track.matrices[last], model.blend), required(previous, "previous"))
+    return step_inputs(model, track.matrices[frame], Past(previous, before, unposed))
 
 
 def _lagged_normal_force(model: Model, advected, body) -> Float[Array, "verts 3 *poses"]:

@@ -319,7 +319,7 @@ def view(
     try:
         import viser  # noqa: F401
     except ImportError:
-        raise InputError("viser is needed to look at a garment live", mend="pip install 'ncs-jax[view]'") from None
+        raise InputError("viser is needed to look at a garment live", mend="pip install viser") from None
     subject = animated_garment(target, scene, motion)
     first = subject.motions[0]
     others = {

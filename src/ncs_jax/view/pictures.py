@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -182,12 +182,14 @@ def animation_gif(
     size: tuple[int, int] = (360, 450),
     view: str = "three-quarter",
     max_bytes: int = 6_000_000,
+    report: Callable[[float], None] | None = None,
 ) -> None:
     """Write an animated GIF that follows the character over a fixed grid, at 15 frames per second or what comes closest.
 
     Args:
         path: of the GIF. animation: to draw. max_frames: of the GIF; a longer animation is cut there. size: width and height in
             pixels. view: one of `VIEWS`. max_bytes: colours and then frames are dropped until it is no larger.
+        report: called with the share of the frames that are drawn.
     """
     if view not in VIEWS:
         raise InputError(f"one of {', '.join(VIEWS)} expected", field="view", value=view)
@@ -202,7 +204,11 @@ def animation_gif(
         return Image.fromarray(render(stage.meshes(frame), at, size, ground=stage.ground(frame, 2.6)))
 
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        pictures = list(pool.map(draw, chosen.tolist()))
+        pictures = []
+        for picture in pool.map(draw, chosen.tolist()):
+            pictures.append(picture)
+            if report is not None:
+                report(len(pictures) / len(chosen))
     colours, step = 255, 1
     while True:
         _write_gif(path, pictures[::step], stride * step / fps, colours)

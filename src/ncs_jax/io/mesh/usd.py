@@ -114,7 +114,7 @@ def _joined(file: Path, table: dict[str, np.ndarray], meshes: Iterable[int]) -> 
 def _installed(file: Path) -> None:
     if find_spec("pxr") is None:
         raise InputError(
-            "the package usd-core is needed for USD", file=file, mend="pip install 'ncs-jax[usd]', or take another format"
+            "the package usd-core is needed for USD", file=file, mend="pip install usd-core, or take another format"
         )
 
 

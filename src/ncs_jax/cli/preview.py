@@ -1,0 +1,46 @@
+"""`ncs preview`: draw a run again, over any motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ncs_jax.cli import arguments
+from ncs_jax.cli.progress import WorkProgress
+
+__all__ = ["add_commands", "draw", "preview"]
+
+
+def add_commands(commands) -> None:
+    """Declare the options."""
+    parser = arguments.command(commands, "preview", preview, "draw a run: a picture, a page that plays it, a GIF, its energies")
+    parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
+    parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first of validation)")
+    parser.add_argument("--out", metavar="DIR", help="folder for the files (default: RUN)")
+
+
+def preview(options) -> int:
+    """Draw a run, and print how it does on the motion."""
+    from ncs_jax.runs.run import load_run
+
+    draw(load_run(options.folder), options.out or options.folder, options.motion, log=Path(options.folder) / "log.csv")
+    return 0
+
+
+def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = None) -> dict[str, float]:
+    """Draw a run into a folder; print each file as soon as it is there, and last how it does on the motion."""
+    from ncs_jax.view.preview import preview
+
+    with WorkProgress("drawing the preview") as progress:
+
+        def show(step) -> None:
+            if step.file is not None:
+                progress.say(f"  {step.file}")
+            progress.show(step.next, step.share, 1.0)
+
+        quantities = preview(run, out, motion, log=log, report=show)
+    scene = run.assembly.scene
+    name = motion or (*scene.motion.validation, *scene.motion.files)[0]
+    never = "" if name in scene.motion.files else ", which it never trained on"
+    inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
+    print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
+    return quantities

@@ -1,0 +1,198 @@
+"""Where a training begins: anew, where a run stopped, or with the weights of another run of the same garment."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ncs_jax.energies.terms import OwnTerm
+from ncs_jax.errors import InputError, InputWarning
+from ncs_jax.prepare.build import Assembly
+from ncs_jax.prepare.prepared import Prepared
+from ncs_jax.prepare.skinning_weights import used_joints
+from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
+from ncs_jax.runs.run import NetworkMaker, Run, assemble, check_own, load_run
+from ncs_jax.scene.model import RitzModes
+from ncs_jax.scene.spec import NetworkSpec, Scene, scene_from
+from ncs_jax.training.step import initial_state
+
+__all__ = ["assemble_run", "facts_of_run", "resumed_scene"]
+
+FREE = ("damping",)  # fields of [network] that no weight depends on
+
+
+def assemble_run(
+    scene: Scene,
+    facts: dict | None,
+    out: Path | None,
+    start: Run | str | Path | None,
+    *,
+    terms: Sequence[OwnTerm],
+    network: NetworkMaker | None,
+) -> tuple[Assembly, dict | None]:
+    """Make the scene of a run ready; return it, and the weights that it begins with where it begins with another run's.
+
+    Args:
+        scene: the run's. facts: of the run that is resumed, if any, in the folder `out`. start: a run to begin from, if any.
+
+    Raises:
+        InputError: a file is unusable, or terms, network or the run to begin from do not fit.
+    """
+    if start is not None:
+        return _assemble_started(start, scene, terms, network)
+    if facts is not None and out is not None:
+        check_own(facts, out, terms, network)
+    assembly = assemble(scene, terms=terms, network=network)
+    if facts is not None and out is not None and facts.get("start"):  # of the run it began from: not found anew
+        assembly = _with_fields_of(read_prepared(out), assembly)
+    return assembly, None
+
+
+# --- where a run stopped ----------------------------------------------------------------------------------------------------
+
+
+def facts_of_run(out: Path | None, resume: bool) -> dict | None:
+    """Return what run.json says of the run to resume, None for a new run.
+
+    Raises:
+        InputError: there is no run to resume, there is one that is not to be resumed, or the folder cannot be written.
+    """
+    if out is not None:
+        check_writable(out)
+    if out is None or not (out / "run.json").exists():
+        if resume:
+            raise InputError("no run to resume", file=out, mend="leave --resume out to begin one")
+        return None
+    if not resume:
+        raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
+    return read_run(out)
+
+
+def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps: int | None) -> Scene:
+    """Return the scene of a run that is resumed; warn where the one given is another.
+
+    Raises:
+        InputError: the seed is another one, the run has more steps than `steps`, or it began from a run and has no checkpoint.
+    """
+    if seed is not None and seed != facts["seed"]:
+        raise InputError("a run keeps its seed", file=out, field="seed", value=seed, mend="leave it out, or begin a new run")
+    done = Checkpoints(out).latest()
+    if done is None and facts.get("start"):
+        raise InputError("no checkpoint there yet", file=out, mend="delete this folder and begin anew")
+    if steps is not None and steps < (done or 0):
+        mend = "give more, or begin a new run"
+        raise InputError(
+            f"at least the {done} steps that the run has expected", file=out, field="steps", value=steps, mend=mend
+        )
+    kept = scene_from(facts["scene"], source=str(out / "run.json"))
+    chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
+    other = [what for what in _differences(kept.to_dict(), scene.to_dict()) if what not in chosen]
+    if other:
+        what = f"{out} keeps the scene that it began with; given otherwise now, and not taken: {', '.join(other)}"
+        warnings.warn(f"{what}; a new run can begin from its weights: --from {out}", category=InputWarning, stacklevel=3)
+    return kept
+
+
+def _differences(kept: dict, given: dict, where: str = "") -> Iterator[str]:
+    """Yield the name of every field that two scenes have different values of."""
+    for key, value in kept.items():
+        if isinstance(value, dict):
+            yield from _differences(value, given[key], f"{where}{key}.")
+        elif json.dumps(value) != json.dumps(given[key]):  # a list and a tuple are one there
+            yield f"{where}{key}"
+
+
+# --- the weights of another run ---------------------------------------------------------------------------------------------
+
+
+def _assemble_started(
+    start: Run | str | Path, scene: Scene, terms: Sequence[OwnTerm], network: NetworkMaker | None
+) -> tuple[Assembly, dict]:
+    """Make a scene ready for a network that another run has trained; return it and the weights.
+
+    The network goes on to read the joints that it has read, whatever moves in the scene's own motions. Its vibrations stay
+    where garment and physics are the same; else they are found anew, and what was learned of them is learned again.
+
+    Raises:
+        InputError: the run's garment has other triangles, or its network other sizes or joints.
+    """
+    run = start if isinstance(start, Run) else load_run(start, network=network)
+    name = "a run" if isinstance(start, Run) else str(start)
+    before = run.assembly
+    if network is None:
+        _check_network(name, before.scene.network, scene)
+    if not scene.body.joints:
+        scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
+    assembly = assemble(scene, terms=terms, network=network)
+    if not np.array_equal(before.garment.faces, assembly.garment.faces):
+        size = f"{len(assembly.garment.vertices)} vertices, {len(assembly.garment.faces)} triangles"
+        expected = f"the triangles of the garment of {name} expected, {len(before.garment.faces)}"
+        raise InputError(expected, file=scene.source, field="garment.file", value=size, mend="train this garment anew")
+    like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0)).params
+    _check_shapes(name, run.params, like, scene)
+    if (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment):
+        assembly = _with_fields_of(before.prepared, assembly)
+    if unread := _unread(assembly):
+        told = f"the network of {name} does not read joints that turn in the motions: {', '.join(unread)}"
+        warnings.warn(f"{told}; what they do to the garment is not learned", category=InputWarning, stacklevel=4)
+    return assembly, jax.tree.map(jnp.array, run.params)  # copies: training uses up what it is given
+
+
+def _check_network(name: str, before: NetworkSpec, scene: Scene) -> None:
+    """Raise an InputError where a scene asks for another network than a run has."""
+    for field in fields(NetworkSpec):
+        expected, found = getattr(before, field.name), getattr(scene.network, field.name)
+        if field.name not in FREE and found != expected:
+            raise InputError(
+                f"the network of {name} expected, {expected}", file=scene.source, field=f"network.{field.name}", value=found,
+                mend=f"write {field.name} = {json.dumps(expected)} under [network]",
+            )  # fmt: skip
+
+
+def _joints(assembly: Assembly) -> tuple[str, ...]:
+    """Return the joints that a network reads as the field `body.joints` has them: names, or numbers where they have none."""
+    names = assembly.body.joint_names if assembly.body is not None else ()
+    inputs = assembly.prepared.inputs.tolist()
+    return tuple(names[i] if len(set(names)) > i and names.count(names[i]) == 1 else str(i) for i in inputs)
+
+
+def _with_fields_of(before: Prepared, assembly: Assembly) -> Assembly:
+    """Return an assembly with the smooth modes and the vibrations that the weights of another one were trained with."""
+    model, prepared = assembly.model, replace(assembly.prepared, basis=before.basis)
+    model = replace(model, basis=jnp.asarray(before.basis, model.basis.dtype))
+    if model.vibrations is not None:
+        prepared = replace(prepared, vibrations=before.vibrations, energy=before.energy)
+        vibrations = RitzModes(*(jnp.asarray(a, model.basis.dtype) for a in (before.vibrations, before.energy)))
+        model = replace(model, vibrations=vibrations)
+    return replace(assembly, model=model, prepared=prepared)
+
+
+def _check_shapes(name: str, params: dict, like: dict, scene: Scene) -> None:
+    """Raise an InputError that names the first array of a network that a run has not, or has of another shape."""
+    shapes = [{jax.tree_util.keystr(at): a.shape for at, a in jax.tree.leaves_with_path(tree)} for tree in (params, like)]
+    for at in (*shapes[1], *shapes[0]):
+        before, expected = (shape.get(at) for shape in shapes)
+        if before != expected:
+            raise InputError(
+                f"weights of the shapes of {name} expected: {at} has {before or 'none'} there", file=scene.source,
+                field="network", value=expected or "none", mend="give the same garment, body, joints and network",
+            )  # fmt: skip
+
+
+def _unread(assembly: Assembly) -> list[str]:
+    """Return the names of joints that carry the garment, turn in the training motions, and are not read by the network."""
+    body, prepared = assembly.body, assembly.prepared
+    if body is None:
+        return []
+    records = [assembly.motions[name] for name in assembly.scene.motion.files]
+    turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in records], axis=0)
+    carrying = used_joints(body.parents.tolist(), np.concatenate([prepared.weights, body.weights[prepared.part]]))
+    found = [j for j in carrying if records and turning[j] and body.parents[j] >= 0 and j not in prepared.inputs]
+    return [body.joint_names[j] if body.joint_names else str(j) for j in found]

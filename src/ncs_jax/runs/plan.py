@@ -1,0 +1,95 @@
+"""How many steps a run has: those that are asked for, or as many as fit into so many minutes from its first step on."""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_right
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ncs_jax.runs.placed_scene import PlacedScene
+from ncs_jax.training.batches import CHUNK
+from ncs_jax.training.step import TrainState
+
+__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within", "whole_chunks"]
+
+ENOUGH = 300  # steps; after fewer, a garment still looks as it did at the start
+EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
+MOST = 10_000_000  # steps
+MARGIN = 1.05  # of the time that is measured
+SLOW = 5.0  # s; a chunk that takes longer is timed once
+
+
+class Costs(NamedTuple):
+    """What training takes, s: a step, a validation, a checkpoint with what goes with it; and after how many steps each is due.
+
+    A validation and a checkpoint are also due at the end.
+    """
+
+    step: float
+    validation: float
+    checkpoint: float
+    lists: float
+    validate_every: int
+    checkpoint_every: int
+
+    def seconds(self, first: int, last: int) -> float:
+        """Return how long the steps first to last take."""
+        validations = -(-last // self.validate_every) - first // self.validate_every
+        checkpoints = -(-last // self.checkpoint_every) - first // self.checkpoint_every
+        lists = sum(first < step <= last for step in EARLY) + last // self.checkpoint_every - first // self.checkpoint_every
+        rare = validations * self.validation + checkpoints * self.checkpoint + lists * self.lists
+        return MARGIN * ((last - first) * self.step + rare)
+
+
+def steps_within(seconds: float, costs: Costs, first: int = 0) -> int:
+    """Return at which step a run that stands at `first` is after so many seconds: a multiple of CHUNK, one chunk at least."""
+    lasts = range((first // CHUNK + 1) * CHUNK, MOST + 1, CHUNK)
+    return lasts[max(0, bisect_right(lasts, seconds, key=lambda last: costs.seconds(first, last)) - 1)]
+
+
+def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[], object] | None, checkpoint: float) -> Costs:
+    """Return what training takes from a state on; every program that it needs is compiled then.
+
+    Args:
+        state: to train from. validate: does what a validation does. checkpoint: how long one takes, s.
+    """
+    spec = placed.assembly.scene.training
+
+    def lists() -> None:
+        placed.refresh(state.params)
+        placed.rebuild_lists(state.params)
+
+    def chunk() -> None:
+        taken, _ = placed.run_chunk(placed.copied(jax.tree.map(jnp.array, state)), 0, CHUNK, CHUNK)
+        placed.measure(placed.local(taken.params), CHUNK)
+        jax.block_until_ready(taken)
+
+    def compiled(work: Callable[[], object]) -> Callable[[], object]:
+        work()
+        return work
+
+    relisted = _seconds(compiled(lists))
+    placed.compile(state, CHUNK)
+    placed.measure(state.params, CHUNK)
+    step = _seconds(chunk)
+    if step < SLOW:  # a first time takes a little more
+        step = _seconds(chunk)
+    validation = 0.0 if validate is None else _seconds(compiled(validate))
+    every = whole_chunks(spec.validate_every), whole_chunks(spec.checkpoint_every)
+    return Costs(step / CHUNK, validation, checkpoint, relisted, *every)
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    """Return how long work takes."""
+    start = time.monotonic()
+    work()
+    return time.monotonic() - start
+
+
+def whole_chunks(steps: int) -> int:
+    """Return the next multiple of CHUNK."""
+    return -(-steps // CHUNK) * CHUNK
