@@ -1,5 +1,7 @@
 """A garment brought onto a body: unit, axes and place, out of the skin, pins, weights."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,8 +9,10 @@ import trimesh
 from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
 from ncs_jax.geometry.mesh import topology
+from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.packaged import ASSETS
-from ncs_jax.prepare.fit import BAND, fit, place
+from ncs_jax.prepare.fit import BAND, fit
+from ncs_jax.prepare.garment_placement import place
 
 from .scenes import post, write_scene
 from .shapes import tube
@@ -51,15 +55,16 @@ def test_a_garment_that_fits_stays_as_it_is(body):
     given = sleeve(0.1)
     found = fit("g.npz", given, body)
     np.testing.assert_array_equal(found.garment.vertices, given.vertices)
-    assert not found.moved.any()
+    assert not found.placement.shift.any()
 
 
 @pytest.mark.parametrize(("scale", "up"), [(0.01, "z"), (0.0254, "y"), (1.0, "z")])
 def test_units_axes_and_place_are_found(body, scale, up):
-    given = sleeve(0.1)
+    given = sleeve(0.085)
     x = (given.vertices + [3, 1, 2]) / scale
     x = x if up == "y" else x @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    placed, moved = place("g.obj", io.GarmentRecord(x, given.faces), body)
+    found = place("g.obj", io.GarmentRecord(x, given.faces), body)
+    placed, moved = found.garment, found.shift
     assert (placed.scale, placed.up) == (scale, up)
     assert np.linalg.norm(moved + [3, 1, 2]) < 1 and np.abs(placed.vertices.mean(axis=0)[[0, 2]]).max() < 0.01
     np.testing.assert_allclose(placed.vertices - placed.vertices.mean(0), given.vertices - given.vertices.mean(0), atol=1e-6)
@@ -76,19 +81,66 @@ def wide_skirt():
 def test_a_wide_skirt_in_place_stays_there():
     """It is not a collar, X up, though as that it would be nearer to the body."""
     x, given = wide_skirt()
-    placed, moved = place("g.obj", given, io.read_body(ASSETS / "body.npz"))
-    assert (placed.scale, placed.up) == (0.01, "z") and not moved.any()
+    found = place("g.obj", given, io.read_body(ASSETS / "body.npz"))
+    placed = found.garment
+    assert (placed.scale, placed.up) == (0.01, "z") and not found.shift.any()
+    assert found.doubt and not place("g.obj", given, io.read_body(ASSETS / "body.npz"), move=(0, 0, 0)).doubt
     np.testing.assert_allclose(placed.vertices, x, atol=1e-6)
 
 
 def test_what_cannot_be_pushed_out_is_refused():
-    with pytest.raises(InputError, match=r"g\.npz: vertices: .*pushed out of the body.*X up.* m out.*--up"):
+    with pytest.raises(InputError, match=r"g\.npz: vertices: .*lies on the body expected.*--up=x.*--move"):
         fit("g.npz", wide_skirt()[1], io.read_body(ASSETS / "body.npz"), scale=0.01, up="x")
 
 
 def test_a_garment_of_no_size_is_refused(body):
     with pytest.raises(InputError, match=r"g\.obj: vertices: a garment about the size of the body.*--scale"):
         place("g.obj", io.GarmentRecord(1e7 * sleeve().vertices, sleeve().faces), body)
+
+
+@pytest.mark.parametrize(
+    ("scale", "up", "offset"),
+    [
+        (1.0, "y", (0.0, -0.21, -0.03)),
+        (0.0254, "y", (0.0, -0.78, 0.0)),
+        (0.3048, "z", (0.25, 0.1, -0.3)),
+        (0.1, "x", (-0.3, 0.2, 0.1)),
+    ],
+)
+def test_a_shirt_of_another_origin_unit_and_axes_comes_home(scale, up, offset):
+    """To 1 cm of where it was made, and its front stays in front; from places whose box lies within the body's box too."""
+    body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
+    x = (shirt.vertices + offset) @ TURNS[up].T / scale
+    found = place("g.obj", replace(shirt, vertices=x), body)
+    assert not found.doubt and (found.scale, found.up, found.turn) == (scale, up, 0) and found.lying > 0.8
+    assert np.linalg.norm(found.garment.vertices - shirt.vertices, axis=1).mean() < 0.01
+
+
+def test_left_handed_axes_are_told_by_faces_that_look_inward():
+    body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
+    found = place("g.obj", replace(shirt, vertices=(shirt.vertices + [0.1, 0.2, 0.1]) * [-1, 1, 1]), body)
+    assert found.mirrored and not found.doubt
+    assert np.linalg.norm(found.garment.vertices - shirt.vertices, axis=1).mean() < 0.01
+
+
+def test_a_shirt_in_another_pose_of_the_arms_is_refused_with_the_bones_in_its_way():
+    """Its sleeves point straight up: no place lets both arms through."""
+    body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
+    x = shirt.vertices.copy()
+    for side in (-1, 1):
+        arm = body.joints[body.joint_names.index("LeftArm" if side * body.joints[8, 0] > 0 else "RightArm")]
+        sleeve = side * (x[:, 0] - arm[0]) > 0
+        c, s = np.cos(side * 1.9), np.sin(side * 1.9)
+        x[sleeve] = (x[sleeve] - arm) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + arm
+    with pytest.raises(InputError, match=r"g\.obj: vertices: .*(bones pass through its cloth|openings).*--move"):
+        fit("g.obj", replace(shirt, vertices=x), body)  # nor is it a sock, in a unit in which nothing is in its way
+
+
+def test_a_place_that_is_given_is_kept():
+    body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
+    found = place("g.obj", replace(shirt, vertices=shirt.vertices + [0.0, 0.01, 0.0]), body, move=(0.0, -0.02, 0.0))
+    np.testing.assert_allclose(found.garment.vertices, shirt.vertices - [0.0, 0.01, 0.0], atol=1e-6)
+    assert found.options == "--scale 1 --up=y --move 0.000 -0.020 0.000"
 
 
 def test_what_nothing_carries_is_pinned_around_its_highest_hole(body):

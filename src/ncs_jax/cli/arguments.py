@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 __all__ = ["FORMATS", "add_body", "body_of", "body_table", "command", "finite", "hosts", "positive", "seed", "whole"]
 
@@ -36,9 +38,12 @@ def body_of(options):
     return io.read_body(options.body, betas=options.betas, part=options.part)
 
 
-def body_table(options) -> str:
-    """Return the lines of a scene file that mean the body of these options."""
-    lines = [f"[body]\nfile = {json.dumps(options.body)}"]
+def body_table(options, folder: Path) -> str:
+    """Return the lines of a scene file in a folder that mean the body of these options."""
+    file = options.body
+    if not file.startswith("ncs:") and not Path(file).is_absolute():
+        file = os.path.relpath(file, folder).replace(os.sep, "/")
+    lines = [f"[body]\nfile = {json.dumps(file)}"]
     lines += [f"{name} = {json.dumps(value)}" for name in ("part", "betas") if (value := getattr(options, name))]
     return "\n".join(lines)
 

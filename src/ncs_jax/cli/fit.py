@@ -4,25 +4,44 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
 from ncs_jax.scene.spec import Scene
 
+if TYPE_CHECKING:
+    import numpy as np
+
 __all__ = ["add_commands", "fit"]
+
+MOTIONS = ("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance")
+LIMBS = {"left arm", "right arm", "left thigh", "right thigh"}  # whose joints the packaged motions must find
 
 
 def add_commands(commands) -> None:
     """Declare the options."""
     parser = arguments.command(
-        commands, "fit", fit, "bring a garment onto a body, and write it as a file to train with, and a picture"
+        commands, "fit", fit, "bring a garment onto a body, and write it as a file to train with, a scene and a picture"
     )
     parser.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .vrm, .fbx, .usd*")
     arguments.add_body(parser)
     parser.add_argument("--mesh", nargs="+", default=[], metavar="NAME", help="meshes of the file that are the garment")
-    parser.add_argument("--out", required=True, metavar="FILE", help=".npz; the picture goes beside it, as .png")
+    parser.add_argument(
+        "--out", required=True, metavar="FILE", help=".npz; beside it a picture, .png, and a scene, .toml, if there is none yet"
+    )
     parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found)")
-    parser.add_argument("--up", choices=("x", "y", "z"), default="", help="the axis that is up in the file (default: found)")
+    parser.add_argument(
+        "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="", help="the axis that is up in the file (default: found)"
+    )
+    parser.add_argument(
+        "--turn", type=int, choices=(0, 90, 180, 270), help="degrees to turn it about the vertical then (default: found)"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--stay", action="store_true", help="do not move it, whatever speaks for another place")
+    where.add_argument(
+        "--move", type=arguments.finite, nargs=3, metavar=("X", "Y", "Z"), help="move it by this, metres (default: found)"
+    )
     parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="merge vertices within M metres")
     parser.add_argument(
         "--clearance",
@@ -34,36 +53,72 @@ def add_commands(commands) -> None:
 
 
 def fit(options) -> int:
-    """Fit a garment to a body, write it with a picture, and print what was done to it."""
-    import numpy as np
-
+    """Fit a garment to a body, write it with a picture and a scene, and print what was done to it."""
     from ncs_jax import io
-    from ncs_jax.io.mesh.surface import boundary_loops
-    from ncs_jax.prepare.fit import PINS
-    from ncs_jax.prepare.fit import fit as fitted
-    from ncs_jax.prepare.garment_checks import summarise_surface
+    from ncs_jax.prepare.fit import settle
+    from ncs_jax.prepare.garment_placement import place
     from ncs_jax.prepare.skinning_weights import with_body_weights
-    from ncs_jax.view.animation import Animation, PosedBody
-    from ncs_jax.view.pictures import contact_sheet
 
     out, scene = Path(options.out), Scene()
     if out.suffix.lower() != ".npz":
         raise InputError(
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
         )
-    body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up, "weld": options.weld}
+    body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), body)
-    asked = {name: value for name, value in (("scale", options.scale), ("up", options.up)) if value}
-    found = fitted(options.garment, given, body, clearance=options.clearance, **asked)
+    known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
+    move = (0.0, 0.0, 0.0) if options.stay else options.move
+    placement = place(options.garment, given, body, move=move, **known)
+    print(f"{options.garment} on {options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles")
+    _say_where(placement)
+    picture = out.with_suffix(".png")
+    try:
+        found = settle(options.garment, placement, body, clearance=options.clearance)
+    except InputError:
+        _draw(picture, body, given.faces, {"refused": placement.garment.vertices})
+        print(f"wrote {picture}: the best place that was found")
+        raise
+    _say_what(found, given)
+    io.write_garment(out, found.garment)
+    _draw(picture, body, given.faces, {"placed": placement.garment.vertices, "out of the body": found.garment.vertices})
+    text = _scene(options, out, found.garment, body)
+    print(f"wrote {out} and {picture}")
+    file = out.with_suffix(".toml")
+    if file.exists():
+        print(f"kept {file}, which is there. A scene for this garment:\n\n{text}", end="")
+    else:
+        file.write_text(text)
+        print(f"wrote {file}, a scene to train:\n\n{text}\nnext: ncs check {file}, ncs train {file}")
+    return 0
+
+
+def _say_where(placement) -> None:
+    """Print unit, axes and place, and how much of the garment lies on the body there."""
+    moved = "not moved"
+    if placement.shift.any():
+        moved = "moved by ({:.3f}, {:.3f}, {:.3f}) m".format(*placement.shift)
+    turned = f", turned by {placement.turn} degrees" if placement.turn else ""
+    print(f"  placed    {placement.scale:g} m a unit, {placement.up.upper()} up{turned}; {moved}")
+    print(
+        f"  lies      {100 * placement.lying:.0f} % on the skin, {100 * placement.inside:.0f} % inside the body; "
+        f"the body passes through {100 * placement.threaded:.0f} % of its openings"
+    )
+    if placement.mirrored:
+        print("  mirrored  left and right were exchanged: its faces looked inward, as left-handed axes make them. If only the")
+        print("            faces are wrong, turn them around in the modeller first")
+
+
+def _say_what(found, given) -> None:
+    """Print what was done to the garment at its place, and what it is made of."""
+    import numpy as np
+
+    from ncs_jax.io.mesh.surface import boundary_loops
+    from ncs_jax.prepare.fit import PINS
+    from ncs_jax.prepare.garment_checks import summarise_surface
+
     g, (before, after) = found.garment, found.depth
     x, parts = g.vertices, summarise_surface(g.vertices, g.faces)
-    shift = ", ".join(f"{v:.3f}" for v in found.moved)
-    pushed = 1000 * np.linalg.norm(x - found.before, axis=1)
-    print(f"{options.garment} on {options.body}: {len(x)} vertices, {len(g.faces)} triangles")
-    print(
-        f"  placed    {g.scale:g} m a unit, {g.up.upper()} up; "
-        + (f"moved by ({shift}) m" if found.moved.any() else "not moved")
-    )
+    pushed = 1000 * np.linalg.norm(x - found.placement.garment.vertices, axis=1)
     print(f"  body      {(before > 0).sum()} vertices were inside, up to {1000 * max(before.max(), 0):.1f} mm; ", end="")
     print(f"{(pushed > 0.01).sum()} moved, by {pushed.max():.1f} mm at most; {(after > 0).sum()} inside now")
     print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
@@ -79,11 +134,37 @@ def fit(options) -> int:
         print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
     spread = f"the body's where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread smoothly from there"
     print("  weights   " + ("the file's own" if given.weights is not None else spread))
-    io.write_garment(out, g)
-    picture, sides = out.with_suffix(".png"), np.repeat(body.vertices[None], 2, axis=0)
-    labels = ("placed", "out of the body")
-    animation = Animation(np.stack([found.before, x]), g.faces, 1.0, PosedBody(sides, body.faces))
-    contact_sheet(picture, animation, frames=2, labels=labels)
-    print(f"wrote {out} and {picture}. In the scene file:\n\n{arguments.body_table(options)}\n")
-    print(f"[garment]\nfile = {json.dumps(out.name)}" + (f'\npins = "{PINS}"' if PINS in g.groups else ""))
-    return 0
+
+
+def _draw(picture: Path, body, faces: np.ndarray, cloths: dict[str, np.ndarray]) -> None:
+    """Draw a garment on the body, once for each label."""
+    import numpy as np
+
+    from ncs_jax.view.animation import Animation, PosedBody
+    from ncs_jax.view.pictures import contact_sheet
+
+    same = np.repeat(body.vertices[None], len(cloths), axis=0)
+    animation = Animation(np.stack(list(cloths.values())), faces, 1.0, PosedBody(same, body.faces))
+    contact_sheet(picture, animation, frames=len(cloths), labels=tuple(cloths))
+
+
+def _scene(options, out: Path, garment, body) -> str:
+    """Return a whole scene for the fitted garment: with the packaged motions where the body's joints can be told apart."""
+    from ncs_jax.prepare.fit import PINS
+    from ncs_jax.prepare.joint_names import anatomy
+    from ncs_jax.prepare.retarget import body_names
+
+    names = body_names(body)
+    moved = names and anatomy(names, body.parents).roles.keys() >= LIMBS
+    lines = [arguments.body_table(options, out.parent), "", "[garment]", f"file = {json.dumps(out.name)}"]
+    lines += [f'pins = "{PINS}"'] if PINS in garment.groups else []
+    lines += ["", "[motion]"]
+    if moved:
+        lines += [f"files = {json.dumps([f'ncs:{name}' for name in MOTIONS])}", 'validation = ["ncs:mixed"]', "fps = 30"]
+    else:
+        lines += [
+            "files = []  # the names of its joints do not tell how packaged motions move them: name its own, say walk.fbx"
+        ]
+    lines += ["", "[physics.collision]", f"thickness = {options.clearance:g}"] if options.clearance != 0.004 else []
+    lines += ["", "[network]", 'cell = "swing"', "", "[training]", "window = 15", "motion_augmentation = 0.5"]
+    return "\n".join(lines) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,18 +13,17 @@ from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import adjacency, topology, with_middles
-from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
-from ncs_jax.prepare.garment_checks import FAR, UNITS, distance_outside
+from ncs_jax.prepare.garment_checks import FAR
+from ncs_jax.prepare.garment_placement import Placement, place
 from ncs_jax.prepare.skinning_weights import transfer_weights
 
-__all__ = ["PINS", "Fitted", "fit", "pins_of", "place", "push_out", "spread_weights"]
+__all__ = ["PINS", "Fitted", "fit", "pins_of", "push_out", "settle", "spread_weights"]
 
 PINS = "pins"  # the vertex group that is written
 PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
-KEEPS_PLACE = 1.5  # a garment is not moved unless its misfit is more than this many times that of the best place
 NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
 LYING, SMOOTH = 0.02, 0.03  # m; see `spread_weights`
 LEAST = 1e-6  # how much the weights of cloth far from the body count
@@ -39,47 +37,43 @@ BAND = 0.02  # m; height of a waistband
 class Fitted:
     """A garment on a body, and what was done to bring it there.
 
-    garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. before: its vertices (V, 3), m,
-    after it was placed and before it was pushed out. moved: by how much it was moved (3,), m. depth: of every vertex inside the
-    body, before and after the push, m, negative outside. carried: its area that lies on what faces up, m^2. lying: share of its
-    vertices that lie on the body.
+    garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. placement: where it was found to
+    belong, before it was pushed out. depth: of every vertex inside the body, before and after the push, m, negative outside.
+    carried: its area that lies on what faces up, m^2. lying: share of its vertices that follow the skin.
     """
 
     garment: GarmentRecord
-    before: np.ndarray
-    moved: np.ndarray
+    placement: Placement
     depth: tuple[np.ndarray, np.ndarray]
     carried: float
     lying: float
 
 
-def fit(
-    file: str | Path,
-    garment: GarmentRecord,
-    body: BodyRecord,
-    *,
-    clearance: float = 0.004,
-    scale: float | None = None,
-    up: str | None = None,
-) -> Fitted:
-    """Bring a garment onto a body. Its own group `pins` and its own weights, if it has them, are kept.
+def fit(file: str | Path, garment: GarmentRecord, body: BodyRecord, *, clearance: float = 0.004, **known) -> Fitted:
+    """Bring a garment onto a body: `place` it, with what is `known` of unit, axes and place, and `settle` it there."""
+    return settle(file, place(file, garment, body, **known), body, clearance=clearance)
+
+
+def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float = 0.004) -> Fitted:
+    """Push a placed garment out of the body, pin and weight it. Its own group `pins` and its own weights, if any, are kept.
 
     Args:
-        file: the garment's, for errors. garment: as read. clearance: least distance of every vertex from the body, m.
-        scale, up: metres a unit of the file and the axis that is up in it; None: they are found.
+        file: the garment's, for errors. placement: from `place`. clearance: least distance of every vertex from the body, m.
 
     Raises:
-        InputError: no unit, axis and place make it lie on the body, or it cannot be pushed out of the body.
+        InputError: the place is in doubt, or the garment cannot be pushed out of the body there.
     """
-    placed, moved = place(file, garment, body, scale=scale, up=up)
+    placement.check(file)
+    placed = placement.garment
     before = placed.vertices
     x = push_out(before, placed.faces, body, clearance)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
         raise InputError(
-            f"a garment that can be pushed out of the body expected, as placed with {placed.scale:g} m a unit and "
-            f"{placed.up.upper()} up", file=file, field="vertices", value=f"{farthest:.2f} m out",
-            mend="bring it onto the body by hand, or state its unit and axis with --scale and --up",
+            f"a garment around the body expected: {100 * placement.inside:.0f} % of it are inside the body, and to come out "
+            f"some of it must move by {farthest:.2f} m or more", file=file, field="vertices",
+            value=f"as its place {placement.options}",
+            mend="look at the picture; give it the pose and size of the body in a modeller, or another place with --move",
         )  # fmt: skip
     surface = surface_from(x, body.vertices, body.faces)
     placed = replace(placed, vertices=x)
@@ -88,84 +82,7 @@ def fit(
     pins, carried = pins_of(placed, body, surface)
     groups = placed.groups if PINS in placed.groups or not len(pins) else {**placed.groups, PINS: pins}
     weights = weights if placed.weights is None else placed.weights
-    return Fitted(replace(placed, groups=groups, weights=weights), before, moved, (depth[0], depth[1]), carried, lying)
-
-
-# --- where it belongs -----------------------------------------------------------------------------------------------
-
-
-def place(
-    file: str | Path, garment: GarmentRecord, body: BodyRecord, *, scale: float | None = None, up: str | None = None
-) -> tuple[GarmentRecord, np.ndarray]:
-    """Return the garment in the unit, with the axis and at the place in which it lies on the body; and how far it moved, m.
-
-    A garment that lies on the body as it is stays so. Else every unit and axis is tried, first without moving it, then moved to
-    where it is least inside the body and nearest to it.
-
-    Raises:
-        InputError: in no unit has it the size of something worn.
-    """
-    found = list(_candidates(garment, body, scale, up, 5)) or list(_candidates(garment, body, scale, up, 10))
-    in_place = [c for c in found if distance_outside(c.vertices, body.vertices) <= FAR]
-    if in_place:
-        return in_place[0], np.zeros(3)
-    if found:
-        _, shift, best = min(((*_best_place(c, body), c) for c in found), key=lambda t: t[0])
-        return replace(best, vertices=best.vertices + shift.astype(best.vertices.dtype)), shift
-    raise InputError(
-        "a garment about the size of the body expected, in any unit", file=file, field="vertices",
-        value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state unit and axis with --scale and --up",
-    )  # fmt: skip
-
-
-def _candidates(
-    garment: GarmentRecord, body: BodyRecord, scale: float | None, up: str | None, least: float
-) -> Iterator[GarmentRecord]:
-    """Yield the garment in every unit and with every axis up in which it has the size of something worn; as given first.
-
-    In a unit other than the given one it must have at least a `least`-th of the body's size: a skirt in inches would fit an arm
-    if it were read in centimetres.
-    """
-    units = (scale,) if scale else dict.fromkeys((garment.scale, *UNITS))
-    axes = (up,) if up else dict.fromkeys((garment.up, "y", "z", "x"))
-    raw = garment.vertices / garment.scale @ TURNS[garment.up].T
-    tall = np.ptp(body.vertices, axis=0).max()
-    for unit in units:
-        for axis in axes:
-            x = upright(raw, unit, axis).astype(garment.vertices.dtype)
-            given = unit == garment.scale and axis == garment.up
-            if tall / (30 if given else least) <= np.ptp(x, axis=0).max() <= 1.1 * tall:
-                yield replace(garment, vertices=x, scale=unit, up=axis)
-
-
-def _best_place(garment: GarmentRecord, body: BodyRecord) -> tuple[float, np.ndarray]:
-    """Return the misfit of a garment where it fits the body best, m, and the shift (3,) to that place, zero if it may stay.
-
-    The misfit is its mean distance from the skin, inside counted five times, divided by how well their normals agree: a ring
-    may lie close to chest and back while it faces elsewhere.
-    """
-    from scipy.optimize import minimize
-    from scipy.spatial import cKDTree
-
-    tree, normals = cKDTree(body.vertices), vertex_normals(body.vertices, body.faces)
-    some = slice(None, None, max(1, len(garment.vertices) // 800))
-    x, facing = garment.vertices[some], vertex_normals(garment.vertices, garment.faces)[some]
-    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
-    trunk = np.median(body.vertices, axis=0)
-
-    def misfit(shift: np.ndarray) -> float:
-        away, index = tree.query(x + shift)
-        side = np.sum((x + shift - body.vertices[index]) * normals[index], axis=1)
-        agreement = abs(np.mean(np.sum(facing * normals[index], axis=1)))  # the garment's normals may also point inward
-        return float(np.mean(np.where(side < 0, 5 * away, away)) / max(agreement, 0.05))
-
-    middle = (x.min(axis=0) + x.max(axis=0)) / 2
-    heights = np.linspace(low[1], high[1], 25)
-    starts = [np.zeros(3), *(np.array([trunk[0], y, trunk[2]]) - middle for y in heights)]
-    first = min(starts, key=misfit)
-    best = minimize(misfit, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 200})
-    here = misfit(np.zeros(3))
-    return (here, np.zeros(3)) if here <= KEEPS_PLACE * best.fun else (float(best.fun), np.asarray(best.x))
+    return Fitted(replace(placed, groups=groups, weights=weights), placement, (depth[0], depth[1]), carried, lying)
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------

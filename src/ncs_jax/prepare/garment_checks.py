@@ -21,6 +21,11 @@ UNITS = {
     0.0254: "inches",
     0.3048: "feet",
     1.0: "metres",
+    0.1: "decimetres",
+    2.54: "inches taken for metres in cm",
+    2.62128: "Poser units",
+    10.0: "tens of metres",
+    39.37: "metres taken for inches",
     100.0: "hundreds of metres",
 }  # metres a unit of a file, and its name
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body

@@ -1,0 +1,331 @@
+"""Where a garment belongs on a body: unit, axes and place, by how it lies on the skin and what passes through it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.mesh.axes import TURNS
+from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.garment_checks import UNITS
+from ncs_jax.prepare.retarget import body_names
+from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, pierced, skin_of, threaded
+
+__all__ = ["AXES", "TURNED", "Placement", "place"]
+
+AXES = ("x", "y", "z", "-x", "-y", "-z")  # that may be up in a file
+TURNED = {0: 1.0, 90: 0.6, 180: 0.75, 270: 0.6}  # degrees about the vertical, and how much such a place counts
+COMMON = (1.0, 0.01, 0.001, 0.0254)  # units that need less of a reason than others
+SIZES = 1 / 10, 1.15  # of the body's: what is worn is between
+STARTS = 3  # so many starts of every unit and orientation are followed
+FINE = 6  # so many of the best places are looked at closely
+STEPS = 1 / 20, 1 / 320  # of the body's height: first and last step of the search
+SKIN = 1 / 80  # of the body's height: cloth is on the skin within about this distance
+ROUGH = 1 / 30, 3.0  # these two, while the places are found roughly
+PRESS = 25.0  # a point deep inside the body counts as one so many times as far outside
+TINY = 1 / 5  # of the body's height: a garment that is smaller is a sock or a doll's, which its unit must be told for
+ON_BODY = 0.05  # least share of a garment that lies on the body
+STAYS = 1.1, 0.5  # the misfit may be so many times that of the best place, and so much of the contact must be there
+RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on, one in another unit from this one on
+APART = 0.02  # of the height: what is nearer is no other place
+FLAT, AWAY = 1.06, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A garment brought to where it lies best, and how well it lies there.
+
+    garment: in metres and Y up at its place. scale, up, turn: metres a unit of the file, the axis that is up in it, and the
+    turn about the vertical after it, degrees. mirrored: left and right were exchanged. shift (3,): how it was moved then, m.
+    lying, inside: shares of its area on the skin, and inside the body. pierced: joints whose bones pass through the cloth.
+    threaded: share of its openings, by length, that the body passes through. doubt: what speaks against it; empty: nothing.
+    """
+
+    garment: GarmentRecord
+    scale: float
+    up: str
+    turn: int
+    mirrored: bool
+    shift: np.ndarray
+    lying: float
+    inside: float
+    pierced: tuple[str, ...]
+    threaded: float
+    doubt: str = ""
+
+    @property
+    def worn(self) -> bool:
+        """Tell whether the body passes through all openings, no bone through the cloth, and next to nothing is inside."""
+        return not self.pierced and self.threaded > 0.99 and self.inside < 0.01
+
+    @property
+    def options(self) -> str:
+        """Return the options of `ncs fit` that bring it exactly here."""
+        x, y, z = self.shift
+        turn = f" --turn {self.turn}" if self.turn else ""
+        return f"--scale {self.scale:g} --up={self.up}{turn} --move {x:.3f} {y:.3f} {z:.3f}"
+
+    def check(self, file: str | Path) -> None:
+        """Raise an InputError where the place is in doubt."""
+        if self.doubt:
+            raise InputError(
+                f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
+                value=f"as its best place {self.options}",
+                mend="if the picture is right, give these options; else others of --scale, --up, --turn and --move, or --stay",
+            )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """One unit and orientation (own: the file's; told: its user gave the unit) and a place: points @ turned * scale + shift."""
+
+    scale: float
+    up: str
+    turn: int
+    turned: np.ndarray
+    prior: float
+    own: bool
+    told: bool
+    shift: np.ndarray
+    cost: float = np.inf
+
+    def points(self, x: np.ndarray) -> np.ndarray:
+        return x @ self.turned * self.scale + self.shift
+
+
+def place(
+    file: str | Path,
+    garment: GarmentRecord,
+    body: BodyRecord,
+    *,
+    scale: float | None = None,
+    up: str | None = None,
+    turn: int | None = None,
+    move: tuple[float, float, float] | None = None,
+) -> Placement:
+    """Return the garment in the unit, with the axes and at the place in which it lies on the body.
+
+    Every unit and orientation is tried at places along the body, moved to where the misfit is least, and the best are compared.
+
+        misfit = mean over the garment's area of  25 d^2 / (|d| + L)  inside the body,
+                                                  L (1 - (n . n_skin) / (1 + (d / L)^2))  outside
+
+    d is the distance to the skin and L an 80th of the body's height. A larger garment is worth more; the body must pass through
+    every opening, and no bone through the cloth. A garment that lies about as well where it is stays there.
+
+    Args:
+        file: the garment's, for errors. garment: as read. scale, up, turn: metres a unit of the file, the axis that is up in
+            it, and the turn about the vertical, degrees. move: from where the file has it then, m. None: found.
+
+    Raises:
+        InputError: in no unit has it the size of something worn.
+    """
+    raw = replace(garment, vertices=garment.vertices / garment.scale @ TURNS[garment.up].T)
+    skin, fine = skin_of(body), cloth_of(raw, 600)
+    ways = list(_ways(garment, raw, skin, fine.volume < 0, (scale, up, turn)))
+    if not ways:
+        raise InputError(
+            "a garment about the size of the body expected, in any unit", file=file, field="vertices",
+            value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state its unit with --scale",
+        )  # fmt: skip
+    here = [replace(w, shift=np.zeros(3) if move is None else np.asarray(move, float)) for w in ways]
+    exact = [skin.nearest(w.points(fine.points), fine.normals @ w.turned) for w in here]
+    near = [float(_misfit(*e, skin, press=ROUGH[1])) for e in exact]  # even if somewhat inside
+    first = sorted(range(len(here)), key=lambda i: (not here[i].own, -_value(replace(here[i], cost=near[i]), fine, skin)))
+    here = [replace(here[i], cost=float(_misfit(*exact[i], skin))) for i in first[:FINE]]
+    found = here if move is not None else [*_search(ways, cloth_of(raw, 100), fine, skin), *here]
+    seen = [(w, _look(w, raw, fine, skin, body)) for w in found]
+    ranked = sorted(seen, key=lambda r: (bool(r[1].doubt), -_value(r[0], fine, skin)))
+    best = ranked[0][0]
+    if move is None and best.prior < 1:  # the best place unturned too: most garments are alike from front and back
+        plain = [w for w in ways if w.scale == best.scale and w.up == best.up[-1] and not w.turn]
+        plain = [_moved(replace(w, shift=best.points(fine.middle) - w.points(fine.middle)), fine, skin) for w in plain]
+        seen += [(w, _look(w, raw, fine, skin, body)) for w in plain]
+        ranked = sorted(seen, key=lambda r: (bool(r[1].doubt), -_value(r[0], fine, skin)))
+    return replace(ranked[0][1], doubt="") if move is not None else _choose(ranked, fine, skin)
+
+
+def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
+    """Yield every unit and orientation in which the garment may be worn."""
+    scale, up, turn = given
+    size = np.ptp(raw.vertices, axis=0).max() / skin.height
+    for unit in (scale,) if scale else dict.fromkeys((garment.scale, *UNITS)):
+        own = unit == garment.scale
+        if (not (own or scale) and not SIZES[0] <= size * unit <= SIZES[1]) or not SIZES[0] / 3 <= size * unit <= 1.5 * SIZES[
+            1
+        ]:
+            continue
+        for axis in (up,) if up else AXES:
+            for angle in TURNED if turn is None else (turn,):
+                turned = TURNS[axis[-1]] @ np.diag([-1, -1, 1] if axis[0] == "-" else [1, 1, 1])
+                c, s = round(np.cos(np.radians(angle))), round(np.sin(np.radians(angle)))
+                turned = turned @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ np.diag([-1 if mirrored else 1, 1, 1])
+                usual = (1.0 if own or unit in COMMON else 0.8) * TURNED[angle] * (0.6 if axis[0] == "-" else 1.0)
+                yield _Way(unit, axis, angle, turned, usual, own and axis == garment.up and not angle, bool(scale), np.zeros(3))
+
+
+def _search(ways: list[_Way], rough: Cloth, fine: Cloth, skin: Skin) -> list[_Way]:
+    """Return the best places: first on few points from many starts, then moved, then on many points."""
+    found = []
+    for unit in dict.fromkeys(w.scale for w in ways):
+        first = []
+        for way in (w for w in ways if w.scale == unit):
+            x, normals = way.points(rough.points), rough.normals @ way.turned
+            starts = np.concatenate([np.zeros((1, 3)), skin.places - way.points(rough.middle)])
+            costs = _misfit(*skin.roughly(x + starts[:, None], normals), skin, *ROUGH)
+            first += [replace(way, shift=starts[k]) for k in np.argsort(costs)[:STARTS]]
+        found += sorted(_stepped(first, rough, skin), key=lambda w: -_value(w, rough, skin))[: 2 * FINE]
+    found = _different(sorted(found, key=lambda w: -_value(w, rough, skin)), skin)[:FINE]
+    return _different(sorted((_moved(w, fine, skin) for w in found), key=lambda w: -_value(w, fine, skin)), skin)
+
+
+def _stepped(ways: list[_Way], cloth: Cloth, skin: Skin) -> list[_Way]:
+    """Return ways moved to where their rough misfit is least: by steps along the axes, which are halved where none helps."""
+    x = np.stack([w.points(cloth.points) - w.shift for w in ways])
+    normals = np.stack([cloth.normals @ w.turned for w in ways])
+    at, step = np.stack([w.shift for w in ways]), np.full(len(ways), STEPS[0] * skin.height)
+    around = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    every = np.arange(len(ways))
+    for _ in range(20):
+        tried = at[:, None] + step[:, None, None] * around
+        costs = _misfit(*skin.roughly(x[:, None] + tried[:, :, None], normals[:, None]), skin, *ROUGH)
+        best = costs.argmin(axis=1)
+        at = tried[every, best]
+        step = np.where(best == 0, np.maximum(step / 2, STEPS[1] * skin.height), step)
+    exact = [_cost(a + b, n, skin) for a, b, n in zip(x, at, normals, strict=True)]
+    return [replace(w, shift=at[i], cost=exact[i]) for i, w in enumerate(ways)]
+
+
+def _different(ways: list[_Way], skin: Skin) -> list[_Way]:
+    """Return the ways without those that repeat an earlier one."""
+    kept: list[_Way] = []
+    for w in ways:
+        same = [k for k in kept if k.scale == w.scale and (k.turned == w.turned).all()]
+        if all(np.linalg.norm(k.shift - w.shift) > AWAY / 2 * skin.height for k in same):
+            kept.append(w)
+    return kept
+
+
+def _moved(way: _Way, cloth: Cloth, skin: Skin) -> _Way:
+    """Return a way moved to where its misfit is least."""
+    from scipy.optimize import minimize
+
+    x, normals = way.points(cloth.points) - way.shift, cloth.normals @ way.turned
+    simplex = way.shift + skin.height / 60 * np.vstack([np.zeros(3), np.eye(3)])
+    best = minimize(
+        lambda shift: _cost(x + shift, normals, skin), way.shift, method="Nelder-Mead",
+        options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 100, "initial_simplex": simplex},
+    )  # fmt: skip
+    return replace(way, shift=best.x, cost=float(best.fun))
+
+
+def _cost(x: np.ndarray, normals: np.ndarray, skin: Skin) -> float:
+    """Return the misfit of points and normals (N, 3), m."""
+    return float(_misfit(*skin.nearest(x, normals), skin))
+
+
+def _misfit(away, side, facing, skin: Skin, near: float = SKIN, press: float = PRESS) -> np.ndarray:
+    """Return the misfit (...,) of points whose distance, side and cosine to the skin (..., N) are given, m."""
+    near = near * skin.height
+    contact = np.maximum(facing, 0) / (1 + (away / near) ** 2)
+    depth = np.where(side < 0, away, 0)
+    return np.mean(np.where(side < 0, press * depth**2 / (depth + near), near * (1 - contact)), axis=-1)
+
+
+def _value(way: _Way, cloth: Cloth, skin: Skin) -> float:
+    """Return the share of contact, less what is inside, times the garment's size, m, and how usual unit and axes are.
+
+    The share alone would choose a doll's dress around an arm, the area of contact a tent that leans on the body.
+    """
+    value = (1 - way.cost / (SKIN * skin.height)) * np.sqrt(cloth.area) * way.scale
+    return value * way.prior if value > 0 else value / way.prior
+
+
+def _look(way: _Way, raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRecord) -> Placement:
+    """Return the garment at a place, how it lies there, and what by itself speaks against it."""
+    away, side, facing = skin.nearest(way.points(cloth.points), cloth.normals @ way.turned)
+    lying = float(np.mean((facing > 0.5) & (away < 2 * SKIN * skin.height)))
+    inside = float(np.mean(side < 0))
+    x = way.points(raw.vertices)
+    names = body_names(body) or tuple(f"joint {j}" for j in range(len(body.parents)))
+    bones = tuple(names[j] for j in pierced(x, raw.faces, skin))
+    share = threaded([x[loop] for loop in cloth.loops], skin)
+    garment = replace(raw, vertices=x.astype(raw.vertices.dtype), scale=way.scale, up=way.up)
+    mirrored, doubt = cloth.volume < 0, _doubt(lying, bones, share)
+    return Placement(garment, way.scale, way.up, way.turn, mirrored, way.shift, lying, inside, bones, share, doubt)
+
+
+def _choose(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> Placement:
+    """Return the best place, or the garment's own where that is about as good, with what speaks against it."""
+    way, best = ranked[0]
+    top, refused = max(ranked, key=lambda r: (_size(r[0], cloth) > TINY * skin.height, _value(r[0], cloth, skin)))
+    placed = not way.shift.any() and not way.turn
+    if best.doubt or (not placed and _value(way, cloth, skin) < RIVAL * _value(top, cloth, skin)):
+        return refused  # what lies far better there is worn there, though it cannot be: a shirt is no sock
+    least = _value(way, cloth, skin)
+    least = least * STAYS[1] if least > 0 else least / STAYS[1]
+    for own, look in sorted(ranked, key=lambda r: (not r[0].own, -r[0].prior)):
+        small = np.linalg.norm(way.shift) < AWAY * skin.height and (own.turned == way.turned).all()
+        alike = own.scale != way.scale or small or own.cost <= STAYS[0] * way.cost
+        if (
+            not (own.shift.any() or look.doubt)
+            and (own.own or own.turn in (0, way.turn))
+            and alike
+            and _value(own, cloth, skin) >= least
+        ):
+            return look
+    kept = [(own, look) for own, look in ranked if not own.shift.any() and not own.turn and look.worn]
+    rival, loose = _rivals(ranked, cloth, skin), _uncertain(way, cloth, skin)
+    if not rival and loose and kept and not kept[0][1].doubt and _value(kept[0][0], cloth, skin) >= least:
+        return kept[0][1]
+    if rival or loose:
+        return replace(kept[0][1] if kept else best, doubt=rival or loose)
+    size = _size(way, cloth)
+    tiny = f"it is {100 * size:.0f} cm large there, and in another unit it might be larger" if size < TINY * skin.height else ""
+    return replace(best, doubt="" if way.told else tiny)
+
+
+def _size(way: _Way, cloth: Cloth) -> float:
+    """Return the longest side of the garment's box, m."""
+    return float(np.ptp(way.points(cloth.points), axis=0).max())
+
+
+def _doubt(lying: float, bones: tuple[str, ...], share: float) -> str:
+    """Return what speaks against a place by itself."""
+    if lying < ON_BODY:
+        return f"{100 * lying:.0f} % of it lie on the skin, at least {100 * ON_BODY:.0f} % are expected"
+    if bones:
+        return f"bones pass through its cloth ({', '.join(bones[:4])}), so it is for another pose or another body"
+    if share <= 0.99:
+        return f"the body passes through {100 * share:.0f} % of its openings by length, not through all"
+    return ""
+
+
+def _rivals(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> str:
+    """Name a second place that is about as good as the first, and elsewhere."""
+    from scipy.spatial import cKDTree
+
+    way = ranked[0][0]
+    tree, least = cKDTree(way.points(cloth.points)), _value(way, cloth, skin)
+    for other, look in ranked[1:]:
+        share = RIVAL if other.scale == way.scale else RESIZED
+        apart = tree.query(other.points(cloth.points))[0].mean()
+        good = _value(other, cloth, skin) > (least * share if least > 0 else least / share)
+        if good and not look.doubt and apart > APART * skin.height:
+            return f"it lies about as well elsewhere, with {look.options}"
+    return ""
+
+
+def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> str:
+    """Name the direction in which the garment may as well be moved."""
+    x, normals = way.points(cloth.points), cloth.normals @ way.turned
+    step = AWAY * skin.height
+    for k, words in ((1, "up or down"), (0, "sideways"), (2, "back or forth")):
+        for sign in (1, -1):
+            if _cost(x + sign * step * np.eye(3)[k], normals, skin) < FLAT * way.cost:
+                return f"it is so loose that it lies as well {100 * step:.0f} cm farther {words}"
+    return ""
