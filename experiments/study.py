@@ -70,7 +70,7 @@ QUICK: dict[str, dict] = {
     "training": {"batch": 4, "window": 5},
     "simulation": {"solver": "quasi_newton", "precision": "single", "iterations": 5},
 }  # the smallest that runs every line; its numbers mean nothing
-FEW = 16  # frames of every motion
+FEW = 24  # frames of every motion
 QUICK_STEPS = 20
 
 
