@@ -56,6 +56,7 @@ files = ["swing.npz"]
 validation = ["swing.npz"]
 fps = 30
 [network]
+cell = "gated"
 static = [16, 16]
 joint = [8]
 dynamic = [16]

@@ -71,7 +71,7 @@ def _fresh(folder, text=SCENE):
 EVERY = SCENE + '[physics.collision]\nfriction = 0.3\ndistance = "smooth"\n[physics.self_contact]\nstiffness = 20\n'
 STILL = SCENE.replace('files = ["swing.npz"]', "files = []").replace('validation = ["swing.npz"]', "")
 
-SWINGING = FREE.replace("[network]", '[network]\ncell = "swing"').replace("[garment]", '[garment]\npins = "pins"')
+SWINGING = FREE.replace('cell = "gated"', 'cell = "swing"').replace("[garment]", '[garment]\npins = "pins"')
 
 
 @pytest.mark.parametrize(

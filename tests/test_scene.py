@@ -5,6 +5,7 @@ import tomllib
 import pytest
 
 from ncs_jax.errors import InputError
+from ncs_jax.prepare.setting import with_cell
 from ncs_jax.scene.spec import PRESETS, Scene, load_scene, scene_from, template
 
 
@@ -100,3 +101,24 @@ def test_missing_files(tmp_path):
         load_scene(tmp_path / "none.toml")
     with pytest.raises(InputError, match="ncs:demo"):
         load_scene("ncs:nothing")
+
+
+@pytest.mark.parametrize(
+    ("changes", "cell"),
+    [
+        ({}, "swing"),
+        ({"motion": {"fps": 15}}, "gated"),
+        ({"motion": {"fps": 15.1}}, "swing"),
+        ({"physics": {"inertia": False}}, "gated"),
+        ({"network": {"method": "snug"}}, "gated"),
+        ({"body": {"file": "none"}}, "gated"),  # it hangs on nothing
+        ({"body": {"file": "none"}, "garment": {"pins": "waist"}}, "swing"),
+        ({"body": {"file": "none"}, "garment": {"pins": "waist"}, "physics": {"pinning": {"stiffness": 0}}}, "gated"),
+        ({"physics": {"collision": {"stiffness": 0}}}, "gated"),
+        ({"network": {"cell": "linear"}}, "linear"),
+    ],
+)
+def test_the_default_cell_is_what_the_scene_can_be_trained_with(changes, cell):
+    found = with_cell(scene_from(changes))
+    assert found.network.cell == cell
+    assert with_cell(scene_from(found.to_dict())) == scene_from(found.to_dict())  # as a run keeps it

@@ -16,15 +16,16 @@ from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.network.methods.swing import QUIET, Swing
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.setting import with_cell
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
-from ncs_jax.simulation.ritz_modes import softest_ritz_modes
+from ncs_jax.simulation.ritz_modes import _slope, softest_ritz_modes
 from ncs_jax.training.loss import gradients
 from ncs_jax.training.step import Task, initial_state, windows_of
 
 from .ready import animated, edited, prepared, ready, run
-from .scenes import grid, write_scene
+from .scenes import SCENE, grid, write_scene
 
 swings = jax.jit(lambda network, *inputs: network.swings(*inputs), static_argnums=0)
 codes_of = jax.jit(lambda network, *inputs: network.codes(*inputs), static_argnums=0)
@@ -84,10 +85,11 @@ def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):
 
 
 def test_a_swing_is_implicit_euler_along_the_vibrations():
-    """Every frame minimises inertia about its own two frames before, and the energy of the vibrations."""
+    """Every frame of a small swing minimises inertia about its own two frames before, and the energy of the vibrations."""
     assembly, params, motion = ready(method="swing")
+    flat = replace(assembly.model.vibrations, slope=0 * assembly.model.vibrations.slope)  # so that no swing is large
     model, network, track = (
-        assembly.model,
+        replace(assembly.model, vibrations=flat),
         replace(assembly.network, damping=0.0),
         features_from_records(assembly.model, motion),
     )
@@ -102,6 +104,71 @@ def test_a_swing_is_implicit_euler_along_the_vibrations():
         away = x[t] - 2 * x[t - 1] + x[max(t - 2, 0)]
         force = np.einsum("vik,v,vi->k", p[t], mass, away) * model.fps**2 + float(model.vibrations.energy) * q[t]
         np.testing.assert_allclose(force, 0, atol=1e-9 * float(model.vibrations.energy))
+
+
+def rms_slope(model, q):
+    """Return sqrt(q^T S q) of swings (frames, modes)."""
+    return np.sqrt(np.einsum("tk,kl,tl->t", q, model.vibrations.slope, q))
+
+
+def test_the_slope_is_that_of_the_garment_as_it_moves(tmp_path):
+    """A field u = A x has the gradient A everywhere, of which a flat sheet sees the two columns of its plane."""
+    mesh = hanging(tmp_path).model.garment.mesh
+    fields = np.random.default_rng(0).normal(size=(3, 3, 2))
+    found = _slope(mesh, np.einsum("ijk,vj->vik", fields, mesh.rest))
+    np.testing.assert_allclose(found, np.einsum("ijk,ijl->kl", fields[:, :2], fields[:, :2]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1.0, 10.0, 100.0, 1e6])
+def test_no_acceleration_brings_a_swing_beyond_its_range(size):
+    """Every frame thrown about by up to so many g: r.m.s. displacement gradients stay below one, and all is finite."""
+    assembly, params, motion = ready(method="swing")
+    model, network = assembly.model, assembly.network
+    thrown = np.random.default_rng(1).uniform(-1, 1, motion.translation.shape) * size * 9.81 / model.fps**2
+    track = features_from_records(model, edited(motion, translation=motion.translation + thrown))
+    q = np.asarray(swings(network, params, model, track))
+    assert np.isfinite(q).all() and rms_slope(model, q).max() < 1 + 1e-12
+    assert size < 10 or rms_slope(model, q).max() > 0.7
+    free = replace(model, vibrations=replace(model.vibrations, slope=0 * model.vibrations.slope))
+    assert size < 100 or rms_slope(model, np.asarray(swings(network, params, free, track))).max() > 2
+
+
+def test_a_small_swing_is_linear_and_a_large_one_only_loses_energy():
+    assembly, _, _ = ready(method="swing")
+    model, network = assembly.model, assembly.network
+    q = jnp.asarray(np.random.default_rng(2).normal(size=(3, 20)))
+    q = q / rms_slope(model, q.T)[None]
+    for size, most in ((0.01, 1e-8), (0.5, 0.016)):
+        np.testing.assert_allclose(network.bounded(model, size * q), size * q, rtol=most)
+    for size in (1.0, 3.0, 100.0):
+        shorter = network.bounded(model, size * q)
+        ratio = np.asarray(shorter / (size * q))  # one of all modes
+        np.testing.assert_allclose(ratio, ratio[:1].repeat(3, axis=0), rtol=1e-12)
+        assert np.all(ratio > 0) and np.all(ratio < 1)
+        assert np.all(rms_slope(model, shorter.T) < 1)
+
+
+def test_a_fresh_network_swings_next_to_nothing():
+    """So training begins at the static garment, and goes along with a swing as far as that pays."""
+    assembly, _, motion = ready(method="swing")
+    params = initial_state(assembly.model, assembly.network, 0).params
+    fast = edited(motion, translation=30 * motion.translation)
+    assert np.abs(swings(assembly.network, params, assembly.model, features_from_records(assembly.model, fast))).max() > 0.1
+    assert np.abs(run(assembly, params, fast, 1.0) - run(assembly, params, fast, 0.0)).max() < 1e-3
+
+
+def test_a_swing_of_an_earlier_version_is_animated_as_it_was():
+    """It has no slope: nothing bounds it, and the garment moves along the vibrations beside what the decoder says."""
+    assembly, params, motion = ready(method="swing")
+    model = replace(assembly.model, vibrations=replace(assembly.model.vibrations, slope=None))
+    track = features_from_records(model, motion)
+    codes = codes_of(assembly.network, params, model, track)
+    turned = np.asarray(blends(track.matrices, model.blend))[..., :3]
+    beside = np.einsum("fvij,vjk,fk->fvi", turned, model.vibrations.directions, codes.swing)
+    bare = replace(model, vibrations=replace(model.vibrations, slope=0 * assembly.model.vibrations.slope))
+    x, without = (np.asarray(animated(m, assembly.network, params, track, 1.0)) for m in (model, bare))
+    assert np.abs(beside).max() > 0.01
+    np.testing.assert_allclose(x - without, beside, atol=1e-12)
 
 
 def test_it_rings_at_its_own_period_and_decays_faster_where_it_is_damped():
@@ -185,8 +252,8 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds():
             blended = blend(m, model.blend)
             body = None if model.body is None else pose_body(model, m)
             frame = StepInputs(1 / model.fps, body=body, vertex_transforms=blended)
-            x = skin(blended, model.garment.mesh.rest + y + d @ q)
-            r = jnp.einsum("vik,v,vi->k", d, mass, y - still) / moved
+            x = skin(blended, model.garment.mesh.rest + y)
+            r = jnp.einsum("vik,v,vi->k", d, mass, y - still) / moved - q
             held = jnp.sum(0.5 * model.fps**2 * moved * r**2 - model.vibrations.energy * q * r)
             return total(x, model.garment, model.material, frame, terms, model.surface) + held
 
@@ -206,7 +273,7 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference, and is told."""
     tables = load_scene(write_scene(tmp_path)).to_dict()
     tables["network"] |= {"cell": "swing", "vibrations": 3}
-    tables["training"] |= {"motion_augmentation": 0.5, "validate_every": 40}
+    tables["training"] |= {"motion_augmentation": 0.5, "validate_every": 40, "learning_rate": 0.02}
     tables["garment"]["pins"], tables["physics"]["collision"]["search"] = "pins", "candidates"
     scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
 
@@ -248,3 +315,11 @@ def test_cloth_that_hangs_on_nothing_is_refused(tmp_path):
         assemble(scene)
     model = assemble(scene.without_network()).model  # a simulation asks for no vibrations, and for no modes
     assert model.vibrations is None and not model.basis.size
+
+
+def test_the_default_cell_is_gated_where_no_vibration_is_found(tmp_path, monkeypatch):
+    monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", lambda *_: None)
+    scene = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"\n', "")))
+    found = assemble(scene)
+    assert scene.network.cell == "auto" and with_cell(scene).network.cell == "swing"
+    assert found.scene.network.cell == "gated" and found.model.vibrations is None and not isinstance(found.network, Swing)

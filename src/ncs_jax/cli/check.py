@@ -57,7 +57,7 @@ def check(options) -> int:
         _tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
     if not risks:
         _tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
-    _tell_scene(setting)
+    _tell_scene(setting, automatic=scene.network.cell == "auto")
     _tell_motions(setting, groups)
     if drawn:
         _tell("picture", drawn)
@@ -73,8 +73,8 @@ def _tell(label: str, text: str) -> None:
     print(textwrap.fill(text, 128, initial_indent=f"  {label:10}", subsequent_indent=14 * " ", break_on_hyphens=False))
 
 
-def _tell_scene(setting: Setting) -> None:
-    """Print what the garment, the body and the physics are."""
+def _tell_scene(setting: Setting, *, automatic: bool) -> None:
+    """Print what the garment, the body and the physics are, and the network's cell, which may be chosen by itself."""
     from ncs_jax.energies.terms import NAMES
     from ncs_jax.prepare.garment_checks import summarise_surface
     from ncs_jax.prepare.joint_names import listed
@@ -105,6 +105,8 @@ def _tell_scene(setting: Setting) -> None:
     if len(model.garment.pins):
         _tell("pins", f"{len(model.garment.pins)} vertices of the group {setting.scene.garment.pins}")
     _tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
+    if setting.scene.network.method == "ncs" and terms.inertia:
+        _tell("cell", setting.scene.network.cell + (" (auto)" if automatic else ""))
 
 
 def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:

@@ -18,7 +18,7 @@ from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.retarget import body_names
-from ncs_jax.prepare.setting import Below, Setting, check_hangs, set_up
+from ncs_jax.prepare.setting import Below, Setting, cell_of, set_up
 from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
@@ -66,6 +66,7 @@ def build(
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
+    automatic, scene = scene.network.cell == "auto", setting.scene
     model, body, track, faces = setting.model, setting.body, None, None
     if prepared is None:
         track = _training_features(setting)
@@ -77,8 +78,8 @@ def build(
         if not prepared.vibrations.size:
             known = required(track, "vibrations", "train again into a new folder")
             prepared = _with_vibrations(scene, prepared, model, faces, known)
-        vibrations = RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype))
-        model = replace(model, vibrations=vibrations)
+        scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
+        model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network_from(scene, model), track)
 
 
@@ -101,7 +102,7 @@ def _training_features(setting: Setting) -> MotionFeatures:
 
 
 def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures) -> Prepared:
-    """Add the garment's vibrations, found with smooth contact, because a simulation converges with no other."""
+    """Add the garment's vibrations, if any, found with smooth contact, because a simulation converges with no other."""
     from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 
     if faces is not None:
@@ -112,11 +113,16 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
         modes = softest_ritz_modes(model, track, count)
         if modes is None:
             return None
-        return {"vibrations": np.asarray(modes.directions), "energy": np.asarray(modes.energy)}
+        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": modes.slope}
+        return {name: np.asarray(array) for name, array in arrays.items()}
 
-    arrays = kept(("vibrations", "energy"), found, model, track, count)
-    check_hangs(scene, model, arrays is not None)
-    return replace(prepared, **required(arrays, "vibrations"))
+    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, model, track, count) or {}))
+
+
+def _vibrations(prepared: Prepared, dtype) -> RitzModes:
+    """Return what was prepared of a swing; without slope it is of a run of an earlier version."""
+    slope = jnp.asarray(prepared.slope, dtype) if prepared.slope.size else None
+    return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), slope)
 
 
 def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeatures:

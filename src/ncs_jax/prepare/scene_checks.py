@@ -18,7 +18,7 @@ from ncs_jax.geometry.surface_distance import signed_distance
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms, world_axes
 from ncs_jax.prepare.posture_checks import posture_faults
-from ncs_jax.prepare.setting import Setting
+from ncs_jax.prepare.setting import RECURRENT, Setting
 from ncs_jax.prepare.touchable import touchable_faces
 from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene
@@ -28,7 +28,7 @@ __all__ = ["RANGES", "Risk", "find_risks"]
 # quantity: (least, most) that is safe
 RANGES = {
     "time step": (1 / 240, 1 / 5),  # s
-    "time step of a recurrence": (1 / 15, 1 / 5),
+    "time step of a recurrence": (RECURRENT, 1 / 5),
     "density": (0.01, 10.0),  # kg/m^2
     "stiffness": (1e-3, 1e4),  # times the default
     "gravity": (0.0, 100 * 9.81),  # m/s^2

@@ -24,9 +24,9 @@ from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.scene.model import Layer, Model
 from ncs_jax.scene.spec import Scene
 
-__all__ = ["Below", "Setting", "check_hangs", "set_up"]
+__all__ = ["RECURRENT", "Below", "Setting", "cell_of", "set_up", "with_cell"]
 
-
+RECURRENT = 1 / 15  # s: the shortest time step that a recurrence, whose inertia is of its own past, is safely trained at
 Below = tuple[io.BodyRecord | None, Layer]  # a trained garment that is worn below, and the body that it was trained on
 
 
@@ -70,20 +70,41 @@ def set_up(
         say("preparing the garment")
         prepared = replace(prepare_scene(files, [motions[name] for name in scene.motion.files]), betas=betas)
     model = model_from(files, prepared, dtype)
-    check_hangs(scene, model)
+    automatic = scene.network.cell == "auto"
+    scene = cell_of(with_cell(scene), not model.moves or model.terms.pinning or model.body is not None, automatic)
     return Setting(scene, prepared, model, files.body, files.garment, motions)
 
 
-def check_hangs(scene: Scene, model: Model, found: bool = True) -> None:
-    """Raise an InputError where a swing is asked of a garment that nothing holds, or for which none was `found`."""
+def with_cell(scene: Scene) -> Scene:
+    """Return the scene with a cell in the place of "auto": the swing where a recurrence is at risk, else the gated one.
+
+    That is where the time step is below `RECURRENT`, the cloth has inertia, and pins or a body hold it.
+    """
+    if scene.network.cell != "auto":
+        return scene
+    physics = scene.physics
+    pinned = bool(scene.garment.pins) and physics.pinning.stiffness > 0
+    held = pinned or (scene.body.file not in ("", "none") and physics.collision.stiffness > 0)
+    short = 1 / scene.motion.fps < RECURRENT * (1 - 1e-6)
+    swings = scene.network.method == "ncs" and physics.inertia and held and short
+    return replace(scene, network=replace(scene.network, cell="swing" if swings else "gated"))
+
+
+def cell_of(scene: Scene, hangs: bool, automatic: bool) -> Scene:
+    """Return the scene with the gated cell in place of a swing that was chosen by itself and does not hang on anything.
+
+    Raises:
+        InputError: such a swing was asked for.
+    """
     network = scene.network
-    if network.method != "ncs" or network.cell != "swing" or not model.terms.inertia:
-        return
-    if not found or (not model.terms.pinning and model.body is None):
+    if hangs or network.method != "ncs" or network.cell != "swing" or not scene.physics.inertia:
+        return scene
+    if not automatic:
         raise InputError(
             "a garment that hangs on something, and swings, expected", file=scene.source, field="network.cell", value="swing",
             mend="pin it, put it on a body, or choose the gated or the linear cell",
         )  # fmt: skip
+    return replace(scene, network=replace(network, cell="gated"))
 
 
 def _betas(scene: Scene) -> np.ndarray:

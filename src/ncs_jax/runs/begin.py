@@ -75,6 +75,16 @@ def facts_of_run(out: Path | None, resume: bool) -> dict | None:
     return read_run(out)
 
 
+def _check_swing(out: Path) -> None:
+    """Raise an InputError where the run to resume has the swing of an earlier version, which is trained no more."""
+    if not (out / "prepared.npz").exists():  # killed before it was written
+        return
+    kept = read_prepared(out)
+    if kept.vibrations.size and not kept.slope.size:
+        mend = "train into a new folder; what this one has learned can still be animated"
+        raise InputError("a swing of this version expected", file=out / "prepared.npz", field="slope", mend=mend)
+
+
 def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps: int | None) -> Scene:
     """Return the scene of a run that is resumed; warn where the one given is another.
 
@@ -92,7 +102,9 @@ def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps:
             f"at least the {done} steps that the run has expected", file=out, field="steps", value=steps, mend=mend
         )
     kept = scene_from(facts["scene"], source=str(out / "run.json"))
+    _check_swing(out)
     chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
+    chosen |= {"network.cell"} if scene.network.cell == "auto" else set()
     other = [what for what in _differences(kept.to_dict(), scene.to_dict()) if what not in chosen]
     if other:
         what = f"{out} keeps the scene that it began with; given otherwise now, and not taken: {', '.join(other)}"
@@ -126,6 +138,8 @@ def _assemble_started(
     run = start if isinstance(start, Run) else load_run(start, network=network)
     name = "a run" if isinstance(start, Run) else str(start)
     before = run.assembly
+    if scene.network.cell == "auto":
+        scene = replace(scene, network=replace(scene.network, cell=before.scene.network.cell))
     if network is None:
         _check_network(name, before.scene.network, scene)
     if not scene.body.joints:
@@ -168,8 +182,9 @@ def _with_fields_of(before: Prepared, assembly: Assembly) -> Assembly:
     model, prepared = assembly.model, replace(assembly.prepared, basis=before.basis)
     model = replace(model, basis=jnp.asarray(before.basis, model.basis.dtype))
     if model.vibrations is not None:
-        prepared = replace(prepared, vibrations=before.vibrations, energy=before.energy)
-        vibrations = RitzModes(*(jnp.asarray(a, model.basis.dtype) for a in (before.vibrations, before.energy)))
+        found = {"vibrations": before.vibrations, "energy": before.energy, "slope": before.slope}
+        prepared = replace(prepared, **found)
+        vibrations = RitzModes(*(jnp.asarray(a, model.basis.dtype) for a in found.values()))
         model = replace(model, vibrations=vibrations)
     return replace(assembly, model=model, prepared=prepared)
 

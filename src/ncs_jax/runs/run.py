@@ -207,6 +207,8 @@ def assemble(
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
     """
+    if network is not None and scene.network.cell == "auto":  # one's own needs no vibrations, unless the scene asks for them
+        scene = replace(scene, network=replace(scene.network, cell="gated"))
     assembly = build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report)
     if terms:
         assembly = replace(assembly, model=assembly.model.with_terms(terms))

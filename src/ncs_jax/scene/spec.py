@@ -185,7 +185,7 @@ class NetworkSpec:
     static: tuple[int, ...] = _f((64, 128, 256), "layer sizes, static encoder; snug takes the last", low=1, high=65536)
     joint: tuple[int, ...] = _f((32, 32), "layer sizes, dynamic encoder, each joint by itself", low=1, high=65536)
     dynamic: tuple[int, ...] = _f((256, 256), "layer sizes, dynamic encoder, all joints; snug's encoder", low=1, high=65536)
-    cell: str = _f("gated", "recurrent cell of ncs, see docs/choosing.md", choices=("gated", "linear", "swing"))
+    cell: str = _f("auto", "what ncs remembers by, see docs/choosing.md", choices=("auto", "gated", "linear", "swing"))
     vibrations: int = _f(12, "number of the garment's vibrations that a swing cell moves", low=1, high=256)
     damping: float = _f(0.3, "damping of a swing cell, 1/s", low=0, high=1e6)
     decoder: tuple[int, ...] = _f((256, 256, 256), "layer sizes, decoder", low=1, high=65536)

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from ncs_jax.energies.inertia import G, out_of_balance
 from ncs_jax.geometry.laplacian_modes import modal_basis
+from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
@@ -187,4 +188,13 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
         np.asarray(transforms, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
     )
     dtype = model.basis.dtype
-    return RitzModes(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype))
+    return RitzModes(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype), jnp.asarray(_slope(mesh, directions), dtype))
+
+
+def _slope(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
+    """Return the mean over the garment of grad d_k : grad d_l (modes, modes), gradients in the plane of the rest state."""
+    corner = directions[np.asarray(mesh.faces)]
+    edges = np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=2)
+    gradient = np.einsum("fiek,fea->fiak", edges, np.asarray(mesh.face_axes, np.float64))
+    area = np.asarray(mesh.face_area, np.float64)
+    return np.einsum("f,fiak,fial->kl", area / area.sum(), gradient, gradient, optimize=True)

@@ -183,11 +183,11 @@ def decode(
     code: Float[Array, "*frames code"],
     swing: Float[Array, "*frames modes"] | None = None,
 ) -> Float[Array, "verts 3 *frames"]:
-    """Return offsets in unposed space, m: those of the code, and those of a swing along the model's vibrations."""
+    """Return offsets in unposed space, m: those of the code, with a run of an earlier version those of a swing beside them."""
     offsets = jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
-    if swing is None:
+    if swing is None or (vibrations := required(model.vibrations, "model.vibrations")).slope is not None:
         return offsets
-    return offsets + jnp.tensordot(required(model.vibrations, "model.vibrations").directions, swing, (-1, -1))
+    return offsets + jnp.tensordot(vibrations.directions, swing, (-1, -1))
 
 
 class FromCodes:

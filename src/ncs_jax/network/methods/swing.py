@@ -5,12 +5,14 @@ the directions D of `ritz_modes.softest_ritz_modes`, carried by skinning, P_t = 
 
     (G_t (1 + c h) + h^2 E_0) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
 
-It begins at zero, rings with the garment's own periods, and decays; nothing of it is learned. What is learned is how the cloth
-goes along with a swing, by the static energy alone:
+and, where that is beyond the linear range, stops short of it, see `Swing.bounded`. It begins at zero, rings with the garment's
+own periods, and decays; nothing of it is learned. What is learned is how the cloth goes along with a swing:
 
-    x = skin(rest + decoder(z_S + alpha z_D(q)) + alpha D q)
+    x = skin(rest + decoder(z_S + alpha z_D(q)))
 
-As no past enters that, any pose is trained with any swing, and every step is a descent.
+by the static energy and the inertia of what q and the cloth differ by along the vibrations, `Swing.hold`. A fresh network
+swings next to nothing, and each step goes as far along as its energy pays for. As no past enters, any pose is trained with any
+swing, and every step is a descent.
 """
 
 from __future__ import annotations
@@ -95,7 +97,7 @@ class Swing:
         previous, before = jnp.where(started[None, None] > 0, earlier.reshape(2, *s.shape) + (root - now)[None, None], s[None])
         g, push = _product(model, p, p), _push(model, p, s - 2 * previous + before)
         h = 1 / model.fps
-        q = _times(_inverse(self._stiff(model, g)), self.damping * h * _times(g, q) - push)
+        q = self.bounded(model, _times(_inverse(self._stiff(model, g)), self.damping * h * _times(g, q) - push))
         x = s + jnp.sum(p * q[None, None], axis=2)
         new = jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in (x, previous, now, q, jnp.ones_like(started))])
         q = q.T.reshape(*shape, self.modes)
@@ -137,11 +139,25 @@ class Swing:
             previous, before = swing
             inverse, g, g1, g2, push, begins = frame
             previous, before = jnp.where(begins, 0, previous), jnp.where(begins, 0, before)
-            q = inverse @ (self.damping * h * (g @ previous) + 2 * (g1 @ previous) - g2 @ before - push)
+            q = self.bounded(model, inverse @ (self.damping * h * (g @ previous) + 2 * (g1 @ previous) - g2 @ before - push))
             return (q, previous), q
 
         zero = jnp.zeros(self.modes, push.dtype)
         return lax.scan(step, (zero, zero), (inverse, g, g1, g2, push, number == track.start), unroll=4)[1]
+
+    def bounded(self, model: Model, q: Float[Array, "modes *poses"]) -> Float[Array, "modes *poses"]:
+        """Return a swing that is shorter where it is beyond the linear range: r.m.s. displacement gradients of one, 45 degrees.
+
+            q / (1 + n^4)^(1/4),   n^2 = q^T S q,   S_kl = mean of grad d_k : grad d_l over the garment
+
+        Half of the range is shortened by 1.5 %, and no acceleration brings a swing beyond it. It only takes energy away, like
+        an inelastic stop: E_0 |q|^2 / 2 falls, and what is carried to the next frames is the shorter swing.
+        """
+        slope = _vibrations(model).slope
+        if slope is None:
+            return q
+        square = jnp.sum(q * jnp.tensordot(slope, q, 1), axis=0, keepdims=True)
+        return q * (1 + square * square) ** -0.25
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
         """Return the codes of the last frames, time leading, whose swings the track knows."""
@@ -166,8 +182,7 @@ class Swing:
         offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
         offsets, static = jnp.split(offsets, 2, axis=-1)
         moved = offsets - lax.stop_gradient(static)
-        frames = [offsets + jnp.tensordot(_vibrations(model).directions, q, (-1, -1))]
-        return Offsets(frames, moved), Kept(z[None], q)
+        return Offsets([offsets], moved), Kept(z[None], q)
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return the energy `hold` of what the dynamic code adds to the offsets, and its derivative."""
@@ -188,7 +203,7 @@ class Swing:
     ) -> tuple[Float[Array, "batch"], Array]:
         """Return the inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
 
-            sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i,   g_i = d_i^T M d_i
+            sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i - q_i,   g_i = d_i^T M d_i
 
         It is how inertia changes as the garment moves by r beyond q along the vibrations, for the q that implicit Euler gives.
         Only what the linearised energy does not know of moves it then: the body, above all.
@@ -201,7 +216,7 @@ class Swing:
         along = (d * mass[:, None, None]).reshape(-1, self.modes)
         g = jnp.sum(along * d.reshape(along.shape), axis=0)
         along = along / g[None]
-        r = along.T @ moved.reshape(len(along), -1)
+        r = along.T @ moved.reshape(len(along), -1) - swing.T
         inertia, force = (g * model.fps**2)[:, None] * r, vibrations.energy * swing.T
         return jnp.sum(r * (inertia / 2 - force), axis=0), (along @ (inertia - force)).reshape(moved.shape)
 
