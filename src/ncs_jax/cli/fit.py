@@ -166,5 +166,5 @@ def _scene(options, out: Path, garment, body) -> str:
             "files = []  # the names of its joints do not tell how packaged motions move them: name its own, say walk.fbx"
         ]
     lines += ["", "[physics.collision]", f"thickness = {options.clearance:g}"] if options.clearance != 0.004 else []
-    lines += ["", "[network]", 'cell = "swing"', "", "[training]", "window = 15", "motion_augmentation = 0.5"]
+    lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]
     return "\n".join(lines) + "\n"
