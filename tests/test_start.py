@@ -60,7 +60,7 @@ def test_words_and_missing_files_do_not_wait_for_jax(tmp_path):
 
 def test_a_check_compiles_next_to_nothing_and_loads_no_network(tmp_path):
     """Each program takes 20 ms, or seconds: of the check of a swing there were a hundred, nine of them large."""
-    scene = write_scene(tmp_path, SCENE.replace("[network]", '[network]\ncell = "swing"'))
+    scene = write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))
     ((programs, heavy),) = printed(COUNTED, scene, folder=tmp_path)
     assert 0 < programs <= 10 and not heavy
 
