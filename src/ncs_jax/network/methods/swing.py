@@ -157,7 +157,7 @@ class Swing:
         if slope is None:
             return q
         square = jnp.sum(q * jnp.tensordot(slope, q, 1), axis=0, keepdims=True)
-        return q * (1 + square * square) ** -0.25
+        return q / jnp.sqrt(jnp.sqrt(1 + square * square))
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
         """Return the codes of the last frames, time leading, whose swings the track knows."""
