@@ -36,7 +36,7 @@ METHODS = ["gated", "linear", "swing", "pbns", "snug"]
 # Those that the runtimes of Unity (Sentis) and Unreal (NNE) list, of what a step needs.
 ENGINES = {
     "Add", "Cast", "Concat", "Div", "Expand", "Gather", "Greater", "Identity", "MatMul", "Max", "Mul", "Neg", "ReduceSum",
-    "Relu", "Reshape", "Sigmoid", "Slice", "Sub", "Tanh", "Transpose", "Where",
+    "Relu", "Reshape", "Sigmoid", "Slice", "Sqrt", "Sub", "Tanh", "Transpose", "Where",
 }  # fmt: skip
 
 

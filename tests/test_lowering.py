@@ -19,7 +19,7 @@ SQUARE = np.linspace(-1, 2, 9, dtype=np.float32).reshape(3, 3)
 
 # What a rule does: a function of x (4, 3) and y (3,), and the operators that its graph is to have, Reshape left out.
 FUNCTIONS = {
-    "arithmetic": (lambda x, y: -(x * y - x / (2 + y * y)) + y, "Add Div Mul Neg Sub"),
+    "arithmetic": (lambda x, y: -(x * y - x / (2 + y * y)) + jnp.sqrt(1 + y * y), "Add Div Mul Neg Sqrt Sub"),
     "activations": (
         lambda x, y: jax.nn.sigmoid(x) + jnp.tanh(y) + jax.nn.relu(x) + jnp.maximum(x, y),
         "Add Max Relu Sigmoid Tanh",

@@ -430,6 +430,7 @@ RULES: dict[str, Callable] = {
     "select_n": _select,
     "slice": _slice,
     "split": _split,
+    "sqrt": _elementwise("Sqrt"),
     "squeeze": _squeeze,
     "stack": _stack,
     "sub": _elementwise("Sub"),
