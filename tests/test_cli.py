@@ -18,7 +18,7 @@ from PIL import Image
 from rich.console import Console
 
 from ncs_jax import io
-from ncs_jax.cli import check, main
+from ncs_jax.cli import check, main, preview
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
@@ -409,6 +409,14 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     assert re.search(r"other.npz, which it never trained on:\n  mean strain [0-9.]+ %, penetrating vertices", text)
     page = (out / "preview.html").read_text()
     assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
+
+
+@pytest.mark.parametrize(
+    ("name", "trained"), [("a.bvh", True), ("a.bvh[3:9]", False), ("b.bvh[3:9]", True), ("ncs:walk", True), ("c.bvh", False)]
+)
+def test_what_a_run_was_trained_on_is_known_from_any_folder(tmp_path, monkeypatch, name, trained):
+    monkeypatch.chdir(tmp_path)
+    assert preview._is_trained_on((f"{tmp_path}/a.bvh", f"{tmp_path}/b.bvh[3:9]", "ncs:walk"), name) == trained
 
 
 def test_progress_in_a_terminal_of_80_columns_is_whole():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from ncs_jax.cli import arguments
@@ -40,7 +41,12 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
         quantities = preview(run, out, motion, log=log, report=show)
     scene = run.assembly.scene
     name = motion or (*scene.motion.validation, *scene.motion.files)[0]
-    never = "" if name in scene.motion.files else ", which it never trained on"
+    never = "" if _is_trained_on(scene.motion.files, name) else ", which it never trained on"
     inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
     print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
     return quantities
+
+
+def _is_trained_on(files: Sequence[str], name: str) -> bool:
+    """Tell whether a motion, perhaps named from the current folder, is among the files of a run, whose paths are absolute."""
+    return name in files or str(Path(name).absolute()) in files
