@@ -9,7 +9,7 @@ import numpy as np
 from ncs_jax.geometry.skinning import Blend, Correctives
 from ncs_jax.io.records import BodyRecord
 
-__all__ = ["carried", "corrected_rest", "joint_transforms", "world_axes"]
+__all__ = ["carried", "corrected_rest", "joint_places", "joint_transforms", "world_axes", "world_turns"]
 
 
 def world_axes(poses: np.ndarray, rest_rotations: np.ndarray | None) -> np.ndarray:
@@ -24,14 +24,30 @@ def world_axes(poses: np.ndarray, rest_rotations: np.ndarray | None) -> np.ndarr
     return local if rest_rotations is None else rest_rotations @ local @ np.swapaxes(rest_rotations, -1, -2)
 
 
-def joint_transforms(body: BodyRecord, poses: np.ndarray) -> np.ndarray:
-    """Return the rigid motion [R_j | t_j] (frames, joints, 3, 4) of every joint from rest to pose, its root in place."""
-    turns, joints = world_axes(poses, body.rest_rotations), body.joints.astype(np.float64)
-    places = np.broadcast_to(joints, (len(poses), *joints.shape)).copy()
-    for j, parent in enumerate(body.parents):  # parents come first
+def world_turns(local: np.ndarray, parents: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Return world rotations since rest (frames, joints, 3, 3) of local ones along the world's axes: R_j = R_parent R_local."""
+    turns = local.copy()
+    for j, parent in enumerate(parents):  # parents come first
         if parent >= 0:
             turns[:, j] = turns[:, parent] @ turns[:, j]
-            places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent])
+    return turns
+
+
+def joint_places(turns: np.ndarray, joints: np.ndarray, parents: Sequence[int] | np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return places (frames, joints, 3) by world rotations, p_j = p_parent + R_parent (J_j - J_parent), from the root's."""
+    places = np.zeros(turns.shape[:3])
+    for j, parent in enumerate(parents):
+        if parent < 0:
+            places[:, j] = root
+        else:
+            places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent]).astype(np.float64)
+    return places
+
+
+def joint_transforms(body: BodyRecord, poses: np.ndarray) -> np.ndarray:
+    """Return the rigid motion [R_j | t_j] (frames, joints, 3, 4) of every joint from rest to pose, its root in place."""
+    turns, joints = world_turns(world_axes(poses, body.rest_rotations), body.parents), body.joints.astype(np.float64)
+    places = joint_places(turns, joints, body.parents, joints[0])
     shift = places - np.einsum("tjab,jb->tja", turns, joints)
     return np.concatenate([turns, shift[..., None]], axis=-1)
 

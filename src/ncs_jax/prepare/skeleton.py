@@ -11,6 +11,7 @@ from ncs_jax.errors import required
 from ncs_jax.io import MotionRecord
 from ncs_jax.io.character.rig import quarter_turns
 from ncs_jax.prepare.joint_names import Limbs
+from ncs_jax.prepare.posing import joint_places, world_axes, world_turns
 
 __all__ = [
     "LIMBS",
@@ -40,25 +41,14 @@ def rest_of(motion: MotionRecord) -> tuple[np.ndarray, np.ndarray]:
 
 def joint_turns(motion: MotionRecord) -> np.ndarray:
     """Return each joint's rotation since rest (T, J, 3, 3), seen from its parent, in the world's axes."""
-    turns = Rotation.from_rotvec(motion.poses.reshape(-1, 3).astype(np.float64)).as_matrix().reshape(*motion.poses.shape, 3)
-    axes = motion.rest_rotations
-    return turns if axes is None else axes @ turns @ np.swapaxes(axes, 1, 2)
+    return world_axes(motion.poses, motion.rest_rotations)
 
 
 def forward(motion: MotionRecord, turns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return world rotations since rest (T, J, 3, 3) and positions (T, J, 3) of the joints; rotations may be given."""
     joints, parents = rest_of(motion)
-    given = turns is not None
-    turns = joint_turns(motion) if turns is None else turns
-    places = np.zeros(motion.poses.shape)
-    for j, parent in enumerate(parents):
-        if parent < 0:
-            places[:, j] = joints[j] + motion.translation
-            continue
-        if not given:
-            turns[:, j] = turns[:, parent] @ turns[:, j]
-        places[:, j] = places[:, parent] + turns[:, parent] @ (joints[j] - joints[parent]).astype(np.float64)
-    return turns, places
+    turns = world_turns(joint_turns(motion), parents) if turns is None else turns
+    return turns, joint_places(turns, joints, parents, joints[0] + motion.translation)
 
 
 def sampled(motion: MotionRecord) -> MotionRecord:
