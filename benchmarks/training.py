@@ -28,7 +28,7 @@ from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_me
 from ncs_jax import assemble, local_rotations
 from ncs_jax.energies.elements import elastic
 from ncs_jax.energies.terms import StepInputs, Terms
-from ncs_jax.energies.total import contact_force, distances, energies
+from ncs_jax.energies.total import contact_force, distances, energy_terms
 from ncs_jax.geometry.skinning import blend
 from ncs_jax.network.methods.method import garment_blend
 from ncs_jax.prepare.build import Assembly
@@ -91,7 +91,7 @@ def _energy(model: Model, name: str) -> Callable:
                 given["lagged_normal_force"] = contact_force(
                     given["advected"], given["body"], model.surface, near, model.material
                 )
-            parts = energies(x, model.garment, model.material, StepInputs(1 / model.fps, **given), terms, model.surface)
+            parts = energy_terms(x, model.garment, model.material, StepInputs(1 / model.fps, **given), terms, model.surface)
             return jnp.sum(parts[name])
 
         return jax.value_and_grad(value)(*varied)

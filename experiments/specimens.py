@@ -17,7 +17,7 @@ from ncs_jax import Assembly, Scene, assemble, scene_from
 from ncs_jax.energies.contact.pairs import groups_from, nearby_pairs
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, StepInputs, Terms
-from ncs_jax.energies.total import contact_force, energies
+from ncs_jax.energies.total import contact_force, energy_terms
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.skinning import blend, skin
@@ -172,7 +172,7 @@ def derivatives(terms: Terms, x, along, garment, material, frame, surface):
     """Value, gradient and second derivative along a direction."""
 
     def value(x):
-        return sum(energies(x, garment, material, frame, terms, surface).values())
+        return sum(energy_terms(x, garment, material, frame, terms, surface).values())
 
     slope, second = jax.jvp(jax.grad(value), (x,), (along,))
     return value(x), slope, second

@@ -13,7 +13,7 @@ import pytest
 
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import MEMBRANES, StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 
 from .materials import material
 from .test_objective import situation
@@ -73,7 +73,7 @@ def plain(terms, x, step, shares):
 
     def value(x, transforms):
         at = replace(step, vertex_transforms=transforms)
-        parts = energies(x, garment, material(terms.membrane), at, terms, surface)
+        parts = energy_terms(x, garment, material(terms.membrane), at, terms, surface)
         return sum(shares[name] * part for name, part in parts.items()), parts
 
     slopes, parts = jax.grad(value, argnums=(0, 1), has_aux=True)(x, step.vertex_transforms)

@@ -14,7 +14,7 @@ from ncs_jax.energies.contact.pairs import groups_from
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.elements import elastic
 from ncs_jax.energies.terms import MEMBRANES, Garment, StepInputs, Terms
-from ncs_jax.energies.total import distances, energies, total
+from ncs_jax.energies.total import distances, energy_terms, total
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import mesh_from
 
@@ -57,7 +57,7 @@ def compiled(x, numbers, frame, surface):
 
     def value(x, numbers, dt, previous, before):
         at = dataclasses.replace(frame, dt=dt, previous=previous, before=before)
-        parts = energies(x, garment, numbers, at, ALL, surface)
+        parts = energy_terms(x, garment, numbers, at, ALL, surface)
         return sum(parts.values()), parts
 
     names = ("x", "material", "dt", "previous", "before")
@@ -103,7 +103,7 @@ def test_a_term_that_is_off_is_not_traced(off, differentiate):
         slope = jax.grad(lambda x, *others: total(x, *others, terms, surface))
         assert scopes(jax.make_jaxpr(slope)(*arguments).jaxpr) == on
     else:
-        program, parts = jax.make_jaxpr(lambda *a: energies(*a, terms, surface), return_shape=True)(*arguments)
+        program, parts = jax.make_jaxpr(lambda *a: energy_terms(*a, terms, surface), return_shape=True)(*arguments)
         assert scopes(program.jaxpr) == set(parts) == on
 
 
@@ -125,7 +125,7 @@ def test_a_frame_brings_only_what_is_asked_for(off, lacking):
     terms = dataclasses.replace(ALL, **{n: OFF[n] for n in off})
     bare = dataclasses.replace(frame, **lacking)
     surface_or_none = None if "collision" in off else surface
-    got = jax.jit(lambda x, f: energies(x, garment, material(), f, terms, surface_or_none))(x, bare)
+    got = jax.jit(lambda x, f: energy_terms(x, garment, material(), f, terms, surface_or_none))(x, bare)
     whole = compiled(x, material(), frame, surface)[1]
     assert set(got) == set(NAMES) - set(off)
     for name, value in got.items():
@@ -147,10 +147,10 @@ def test_what_a_term_lacks_is_named(term, field):
     alone = dataclasses.replace(ALL, **{**OFF, term: "plane" if term == "collision" else True})
     bare = dataclasses.replace(garment, groups=None)
     with pytest.raises(InputError, match=f"^{field}: missing"):
-        energies(x, bare, material(), StepInputs(), alone, surface)
+        energy_terms(x, bare, material(), StepInputs(), alone, surface)
     if term == "collision":
         with pytest.raises(InputError, match=r"^surface: missing"):
-            energies(x, garment, material(), StepInputs(body=x), alone)
+            energy_terms(x, garment, material(), StepInputs(body=x), alone)
 
 
 def test_too_many_pairs_are_no_number():
@@ -221,7 +221,7 @@ def test_elements_differentiated_by_themselves_are_the_gradient_of_the_whole(mod
 
     @jax.jit
     def both(poses):
-        value = lambda x: sum(energies(x, garment, numbers, StepInputs(), terms).values())  # noqa: E731
+        value = lambda x: sum(energy_terms(x, garment, numbers, StepInputs(), terms).values())  # noqa: E731
         return elastic(poses, garment, numbers, terms), jax.lax.map(jax.value_and_grad(value), jnp.moveaxis(poses, -1, 0))
 
     (parts, gradient), (values, slopes) = jax.device_get(both(poses))
@@ -312,7 +312,7 @@ def test_material_and_time_step_are_batched():
 
     def parts(leaves, dt):
         at = dataclasses.replace(frame, dt=dt)
-        return energies(x, garment, jax.tree.unflatten(tree, leaves), at, ALL, surface)
+        return energy_terms(x, garment, jax.tree.unflatten(tree, leaves), at, ALL, surface)
 
     together = jax.device_get(jax.jit(jax.vmap(parts))(batch, dts))
     for i in range(3):

@@ -16,7 +16,7 @@ import ncs_jax
 from ncs_jax import InputError
 from ncs_jax.cli import main
 from ncs_jax.energies.terms import MEASURED, NAMES, StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.metrics.motion import MEASURES
 from ncs_jax.metrics.quality import QUANTITIES
 from ncs_jax.network.methods.choose import network_from
@@ -87,7 +87,7 @@ def test_a_term_that_returns_no_energy_is_named(trained, value):
     model = trained.assembly.model
     alone = Terms(None, bending=False, collision=None, gravity=False, inertia=False, own=(mine,))
     with pytest.raises(InputError, match="terms: mine: a scalar expected, the energy in J"):
-        energies(model.garment.mesh.rest, model.garment, model.material, StepInputs(), alone)
+        energy_terms(model.garment.mesh.rest, model.garment, model.material, StepInputs(), alone)
 
 
 def test_terms_are_logged_and_measured_by_their_names(folder, trained, plain_jax):

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ncs_jax.energies.contact.pairs import groups_from, nearby_pairs
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_axis_angle
 from ncs_jax.geometry.skinning import skin, unpose
@@ -87,7 +87,7 @@ def cloth(rolled: bool):
 @functools.partial(jax.jit, static_argnums=0)
 def derivatives(terms, x, along, garment, numbers, frame, surface):
     def value(x):
-        return sum(energies(x, garment, numbers, frame, terms, surface).values())
+        return sum(energy_terms(x, garment, numbers, frame, terms, surface).values())
 
     (found, slope), (_, second) = jax.jvp(jax.value_and_grad(value), (x,), (along,))
     return found, slope, second
@@ -146,7 +146,7 @@ def surface_of(kind):
 
 @functools.partial(jax.jit, static_argnums=0)
 def slopes(terms, x, garment, numbers):
-    return jax.value_and_grad(lambda x: sum(energies(x, garment, numbers, StepInputs(1 / 30), terms).values()))(x)
+    return jax.value_and_grad(lambda x: sum(energy_terms(x, garment, numbers, StepInputs(1 / 30), terms).values()))(x)
 
 
 @pytest.mark.parametrize("term", ["stvk", "neo_hookean", "baraff_witkin", "mass_spring", "bending"])

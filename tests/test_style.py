@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from types import GenericAlias
 
@@ -181,10 +182,6 @@ def test_every_export_exists_once_and_says_what_it_is(name):
         assert home or MODULES[name].name == "__init__.py", f"{full} exports {export} of another module"
 
 
-def _is_an_old_name(node: ast.AST) -> bool:
-    return isinstance(node, ast.Assign) and isinstance(node.value, ast.Name) and isinstance(node.targets[0], ast.Name)
-
-
 @pytest.mark.parametrize("name", [m for m, p in MODULES.items() if p.name == "__init__.py"])
 def test_a_package_face_only_passes_on_what_its_modules_export(name):
     """One import path per symbol: the package's, and that of the module where it is defined."""
@@ -193,7 +190,6 @@ def test_a_package_face_only_passes_on_what_its_modules_export(name):
     seen = [*face.body, *(n for block in face.body if isinstance(block, ast.If) for n in block.body)]  # by type checkers too
     sources = [n for n in seen if isinstance(n, ast.ImportFrom) and n.module.startswith("ncs_jax")]
     brought = [alias.asname or alias.name for n in sources for alias in n.names]
-    brought += [n.targets[0].id for n in seen if _is_an_old_name(n)]
     assert sorted(brought) == sorted(exports) == sorted(set(exports))
     for node in sources:
         home = importlib.import_module(node.module)
@@ -203,14 +199,14 @@ def test_a_package_face_only_passes_on_what_its_modules_export(name):
 
 
 def test_the_names_of_the_package_are_those_that_type_checkers_see():
-    """Each is imported when it is first read, from the module where they see it; `energies` is the function."""
+    """Each is imported when it is first read, from the module where they see it."""
     face = tree(MODULES[""])
     blocks = [n for block in face.body if isinstance(block, ast.If) for n in block.body]
     seen = {alias.name: n.module for n in blocks if isinstance(n, ast.ImportFrom) for alias in n.names}
     assert seen == ncs_jax._HOME
     for name, module in seen.items():
         assert getattr(ncs_jax, name) is getattr(importlib.import_module(module), name)
-    assert ncs_jax.Frame is ncs_jax.StepInputs
+    assert ncs_jax.__version__ == metadata.version("ncs-jax")
     assert set(ncs_jax.__all__) <= set(dir(ncs_jax))
     assert not hasattr(ncs_jax, "anything_else")
 

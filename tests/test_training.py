@@ -10,7 +10,7 @@ import pytest
 
 from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.energies.terms import StepInputs
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.model import pose_body
@@ -48,7 +48,7 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
         x, previous, before = (skin(blend(m, model.blend), rest + offset) for m, offset in zip(matrices, offsets, strict=True))
         terms = dataclasses.replace(model.terms, collision=None)
         body = pose_body(model, matrices[0])
-        parts = energies(x, model.garment, model.material, StepInputs(1 / model.fps, previous, before), terms)
+        parts = energy_terms(x, model.garment, model.material, StepInputs(1 / model.fps, previous, before), terms)
         return parts, x, body, vertex_normals(body, model.surface)
 
     exact = double(model)
@@ -204,7 +204,7 @@ def test_cloth_that_comes_too_near_itself_is_pushed_apart(plain_jax):
         terms = dataclasses.replace(
             model.terms, membrane=None, bending=False, collision=None, gravity=False, inertia=False, pinning=False
         )
-        return energies(x, model.garment, model.material, StepInputs(), terms)["self_contact"]
+        return energy_terms(x, model.garment, model.material, StepInputs(), terms)["self_contact"]
 
     offsets = jnp.asarray(fold, jnp.float32)
     before, slope = jax.jit(jax.value_and_grad(value))(offsets)

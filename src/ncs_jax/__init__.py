@@ -3,11 +3,12 @@
 import importlib
 import sys
 import types
+from importlib import metadata
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ncs_jax.energies.terms import Garment, Material, StepInputs, Terms
-    from ncs_jax.energies.total import energies, total
+    from ncs_jax.energies.total import energy_terms, total
     from ncs_jax.errors import InputError
     from ncs_jax.metrics.quality import measure, summarise
     from ncs_jax.network.rollout import animate, stepper
@@ -20,11 +21,8 @@ if TYPE_CHECKING:
     from ncs_jax.scene.spec import Scene, load_scene, scene_from
     from ncs_jax.scene.step_inputs import frame_inputs
 
-    Frame = StepInputs
-
 __all__ = [
     "Assembly",
-    "Frame",
     "Garment",
     "InputError",
     "Material",
@@ -37,7 +35,7 @@ __all__ = [
     "Trajectory",
     "animate",
     "assemble",
-    "energies",
+    "energy_terms",
     "frame_inputs",
     "load_run",
     "load_scene",
@@ -54,7 +52,7 @@ __all__ = [
 # The same names by the module that each is imported from when it is first read: JAX alone takes a second to import.
 _HOMES = {
     "energies.terms": ("Garment", "Material", "StepInputs", "Terms"),
-    "energies.total": ("energies", "total"),
+    "energies.total": ("energy_terms", "total"),
     "errors": ("InputError",),
     "metrics.quality": ("measure", "summarise"),
     "network.rollout": ("animate", "stepper"),
@@ -68,29 +66,20 @@ _HOMES = {
     "scene.step_inputs": ("frame_inputs",),
 }
 _HOME = {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
-_OLD = {"Frame": "StepInputs"}  # names until version 0.1
 
 
 class _Face(types.ModuleType):
     """The package itself, whose names are imported when they are first read."""
 
     def __getattr__(self, name: str):
-        name = _OLD.get(name, name)
+        if name == "__version__":
+            return metadata.version("ncs-jax")
         if name not in _HOME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return getattr(importlib.import_module(_HOME[name]), name)
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *__all__})
-
-    @property
-    def energies(self):
-        """Return the function, and not the package of that name, which any import from it would leave here."""
-        return self.__getattr__("energies")
-
-    @energies.setter
-    def energies(self, package) -> None:
-        pass
 
 
 sys.modules[__name__].__class__ = _Face

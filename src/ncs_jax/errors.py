@@ -7,7 +7,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-__all__ = ["InputError", "InputWarning", "required"]
+__all__ = ["InputError", "InputWarning", "required", "shaped"]
 
 
 class InputError(ValueError):
@@ -42,6 +42,21 @@ def required(value: T | None, field: str, mend: str | None = None) -> T:
     if value is None:
         raise InputError("missing, and needed here", field=field, mend=mend)
     return value
+
+
+def shaped(value, last: tuple[int, ...], field: str, what: str, mend: str | None = None) -> None:
+    """Check that an array ends with these axes and holds real numbers: known while it is traced, and free afterwards.
+
+    Args:
+        last: lengths of the last axes. field: the argument's name. what: the array in words, with its axes and unit.
+
+    Raises:
+        InputError: the axes are others, or the numbers are whole.
+    """
+    if value.shape[max(value.ndim - len(last), 0) :] != last:
+        raise InputError(f"{what} expected", field=field, value=f"shape {value.shape}", mend=mend)
+    if value.dtype.kind in "biuc":
+        raise InputError("floating-point numbers expected", field=field, value=str(value.dtype), mend="give float32")
 
 
 def _short(value: object, limit: int = 80) -> str:

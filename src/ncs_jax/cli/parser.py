@@ -76,6 +76,7 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="ncs", description=DESCRIPTION, formatter_class=raw)
+    parser.add_argument("--version", action="version", version=f"ncs-jax {version('ncs-jax')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (train, preview, animate, simulate, evaluate, body, fit, view, check):
         group.add_commands(commands)

@@ -17,7 +17,7 @@ from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.mass_spring import per_edge
 from ncs_jax.energies.membrane import per_face
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import corners
 from ncs_jax.geometry.soa_vectors import plus
@@ -33,7 +33,7 @@ def energies_and_gradient(
     terms: Terms,
     surface: Surface | None = None,
 ) -> tuple[dict[str, Float[Array, "*poses"]], Float[Array, "verts 3 *poses"], Float[Array, "verts 3 4 *poses"] | None]:
-    """Return every term of `total.energies` by name in J, and the derivatives of their sum.
+    """Return every term of `total.energy_terms` by name in J, and the derivatives of their sum.
 
     Returns:
         The energies; their gradient by x in N; and that by the vertex transforms, which pins and own terms read, else None.
@@ -51,7 +51,7 @@ def energies_and_gradient(
     )
 
     def value(x):
-        some = energies(x, garment, material, step, lanes, surface)
+        some = energy_terms(x, garment, material, step, lanes, surface)
         return jnp.sum(sum(some.values(), start=jnp.zeros((), x.dtype))), some
 
     slope, some = jax.grad(value, has_aux=True)(x)
@@ -93,7 +93,7 @@ def _one_pose(x, garment, material, step: StepInputs, terms: Terms, surface):
     """The same of one pose: the sum of its terms, differentiated."""
 
     def value(x, transforms):
-        parts = energies(x, garment, material, replace(step, vertex_transforms=transforms), terms, surface)
+        parts = energy_terms(x, garment, material, replace(step, vertex_transforms=transforms), terms, surface)
         return sum(parts.values(), start=jnp.zeros((), x.dtype)), parts
 
     transforms = step.vertex_transforms

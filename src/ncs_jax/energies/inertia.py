@@ -24,7 +24,7 @@ def inertia(
 
         E = 1 / (2 dt^2) sum_v m |x_t - x_proj|^2
 
-    The target is a plain argument: whoever trains decides whether it carries a gradient (`total.energies` stops it).
+    The target is a plain argument: whoever trains decides whether it carries a gradient (`total.energy_terms` stops it).
 
     Args:
         x, target: (verts, 3, *poses) in m. mass: (verts,) in kg. dt: time step in s.

@@ -61,7 +61,9 @@ MEASURED = (
 class OwnTerm(Protocol):
     """A term of one's own: a pure function `term(x, step)` that returns an energy in J and is differentiable by x.
 
-    x: positions (verts, 3) in m. step: the model's `StepInputs` of one pose. It is known by its `__name__`.
+    x: positions (verts, 3) in m. step: the model's `StepInputs` of one pose. It is known by its `__name__`. Where the network
+    has no past while it trains (a swing's loss is static, and so is PBNS's), `step.previous` and `step.before` are None: a term
+    of the velocity, such as drag, needs `network.cell = "gated"`.
     """
 
     __name__: str
@@ -103,7 +105,13 @@ class Terms:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Material:
-    """The numbers of the energies, in SI units; any of them may be differentiated or batched."""
+    """The numbers of the energies, in SI units; any of them may be differentiated or batched.
+
+    density: kg/m^2. membrane: in the order of `MEMBRANES`: Lame's lam and mu, N/m, for "stvk" and "neo_hookean"; stretch and
+    shear, N/m, for "baraff_witkin"; stiffness, N/m, for "mass_spring". bending: N m. collision: J/m^2 a vertex, at `thickness`
+    (m) from the body. friction: its coefficient. pinning: N/m. gravity: (3,), m/s^2. self_contact: J/m^2 a pair, at
+    `self_thickness` (m).
+    """
 
     density: Float[Array, ""]  # kg/m^2
     membrane: tuple[Float[Array, ""], ...]  # in the order of MEMBRANES
@@ -130,7 +138,12 @@ class Garment:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StepInputs:
-    """What one step brings to the energies; `None` where no term asks for it. `scene.step_inputs` prepares it.
+    """What one step brings to the energies; `None` where no term asks for it.
+
+    `frame_inputs` makes it for a frame of a motion; `StepInputs(dt, previous, before)` is enough without a body.
+    dt: s. previous, before: the garment one and two steps ago, m. body: posed, m, with its normals. vertex_transforms: what
+    skinning does to every vertex. advected: where the body alone would carry the garment, m. lagged_normal_force: of contact
+    there, N. force: external, N. moving: what inertia counts, 0 for a pose without a past.
 
     With several poses beside each other every array has them as its last axis.
     """

@@ -22,9 +22,10 @@ from ncs_jax.energies.inertia import inertia, project
 from ncs_jax.energies.pinning import pinning
 from ncs_jax.energies.terms import MEMBRANES, Garment, Material, OwnTerm, StepInputs, Terms
 from ncs_jax.errors import InputError, required
+from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.skinning import unpose
 
-__all__ = ["body_collision", "contact_force", "distances", "energies", "total"]
+__all__ = ["body_collision", "contact_force", "distances", "energy_terms", "total"]
 
 
 def distances(
@@ -79,7 +80,13 @@ def _friction(x, step: StepInputs, material: Material):
     return _counted(friction(x, advected, pressed, material.friction, step.dt), step.moving)
 
 
-def energies(
+def _check_positions(x, mesh: Mesh) -> None:
+    if x.shape[:2] != mesh.rest.shape:
+        what, mend = f"positions {mesh.rest.shape} or ({len(mesh.rest)}, 3, poses) expected", "use jax.vmap over a leading axis"
+        raise InputError(what, field="x", value=f"shape {x.shape}", mend=mend)
+
+
+def energy_terms(
     x: Float[Array, "verts 3 *poses"],
     garment: Garment,
     material: Material,
@@ -102,6 +109,7 @@ def energies(
     Source: slides, equation (10).
     """
     mesh, parts = garment.mesh, {}
+    _check_positions(x, mesh)
     mass = material.density * mesh.vertex_area
     if terms.membrane is not None:
         with jax.named_scope("membrane"):
@@ -143,7 +151,15 @@ def energies(
 
 def _own_energy(term: OwnTerm, x, step: StepInputs):
     """Return the energy by a term of one's own, J, after a check that it is a scalar."""
-    value = term(x, step)
+    try:
+        value = term(x, step)
+    except (TypeError, AttributeError) as fault:
+        if step.previous is not None and step.before is not None:
+            raise
+        raise InputError(
+            f"a term expected that does without step.previous and step.before, which are None here: {fault}",
+            field=f"terms: {term.__name__}", mend="a swing and PBNS train without a past: network.cell = 'gated' has one",
+        ) from fault  # fmt: skip
     if not isinstance(value, int | float | np.generic | np.ndarray | jax.Array) or jnp.shape(value) != ():
         found = type(value).__name__ if value is None or not hasattr(value, "shape") else f"an array of shape {value.shape}"
         raise InputError("a scalar expected, the energy in J", field=f"terms: {term.__name__}", value=found, mend="sum it")
@@ -151,5 +167,5 @@ def _own_energy(term: OwnTerm, x, step: StepInputs):
 
 
 def total(*arguments, **options) -> Float[Array, ""]:
-    """Return the total energy (10) in J: the sum of `energies`, called alike."""
-    return sum(energies(*arguments, **options).values(), start=jnp.zeros(()))
+    """Return the total energy (10) in J: the sum of `energy_terms`, called alike."""
+    return sum(energy_terms(*arguments, **options).values(), start=jnp.zeros(()))

@@ -26,7 +26,7 @@ from ncs_jax.energies.inertia import out_of_balance
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import Terms
 from ncs_jax.energies.total import distances
-from ncs_jax.errors import required
+from ncs_jax.errors import InputError, required, shaped
 from ncs_jax.geometry.mesh import Mesh, corners, edge_strain, with_middles
 from ncs_jax.geometry.numerics import angle_between, arctan2
 from ncs_jax.geometry.skinning import blend, unpose
@@ -189,16 +189,23 @@ def measure(
     """Return every quantity of `QUANTITIES` and every energy term in J, per frame, of any animation of the model's garment.
 
     Args:
-        vertices: (frames, verts, 3) in m, from a network, a simulation or a file. track: the motion it belongs to.
-
+        vertices: (frames, verts, 3) in m, from a network, a simulation or a file: of the motion's first frames, or of all.
+        track: the motion it belongs to.
         exact: penetration by the exact signed distance to the body's triangles, also of the middles of the edges; else by the
             scene's own query, which is faster.
         self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
 
     Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
     taken to have been at rest.
+
+    Raises:
+        InputError: the vertices are not the garment's, or there are more frames than the motion has.
     """
-    count = len(vertices)
+    count, frames = len(vertices), len(track.start)
+    verts = len(model.garment.mesh.rest)
+    shaped(vertices, (verts, 3), "vertices", f"the garment's {verts} vertices (frames, {verts}, 3), m,")
+    if count > frames:
+        raise InputError(f"at most the track's {frames} frames expected", field="vertices", value=f"{count} frames")
     positions = track.relative(np.asarray(vertices)).astype(model.basis.dtype, copy=False)
     programs: list[Callable] = [functools.partial(_energies_and_shape, model)]
     if model.surface is not None:

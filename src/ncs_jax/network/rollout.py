@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ncs_jax.errors import InputError, shaped
 from ncs_jax.geometry.skinning import Blend, forward, transforms
 from ncs_jax.network.methods.method import Method, decode, for_inference, garment_blend
 from ncs_jax.scene import descriptors
@@ -23,6 +24,7 @@ from ncs_jax.scene.model import Model, pose_garment
 __all__ = ["Rollout", "StreamState", "animate", "animated", "first_broken", "stepper"]
 
 BLOCK = 32  # garments decoded and skinned together
+LOCAL = "ncs_jax.local_rotations makes them from poses"
 PADDED = 64  # frames in whole blocks of which a motion is animated
 
 
@@ -57,7 +59,7 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
     rest = model.garment.mesh.rest
     network, params = for_inference(network, params, model)
     weights = garment_blend(network, params, model)
-    g = model.material.gravity
+    g, joints = model.material.gravity, len(model.skeleton.parents)
 
     def init(*characters: int) -> StreamState:
         n, new = len(model.inputs), partial(np.zeros, dtype=rest.dtype)
@@ -78,7 +80,13 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
         return now, previous, transforms(model.skeleton, pose), descriptors.static(now, g, model.descriptor), dynamic
 
     def step(state: StreamState, rotations, translation, alpha=1.0):
-        characters = rotations.shape[:-3]
+        characters = state.started.shape
+        if rotations.ndim != len(characters) + 3:
+            mend = "begin with the state of init(number of characters), or of init() for one"
+            what = f"rotations {(*characters, joints, 3, 3)} for this state"
+            raise InputError(f"{what} expected", field="rotations", value=f"shape {rotations.shape}", mend=mend)
+        shaped(rotations, (*characters, joints, 3, 3), "rotations", f"{joints} joints' local rotations", LOCAL)
+        shaped(translation, (*characters, 3), "translation", "the root's translation (3,), m, for every character")
         every = look
         for _ in characters:
             every = jax.vmap(every)

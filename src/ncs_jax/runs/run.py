@@ -44,13 +44,16 @@ class Run:
     steps: int = 0
     lacking: tuple[str, ...] = ()  # names of own terms that it was trained with and that were not given again
 
-    def track(self, motion: str) -> MotionFeatures:
-        """Return a motion, ready to animate: a file, `ncs:NAME`, or one as the scene names it.
+    def track(self, motion: str | io.MotionRecord | MotionFeatures) -> MotionFeatures:
+        """Return a motion, ready to animate: a file, `ncs:NAME`, one as the scene names it, or a record of poses.
 
         Raises:
             InputError: the motion cannot be read, is not in metres, or does not fit the body.
         """
-        return features_from_records(self.assembly.model, self.motion(motion))
+        if isinstance(motion, MotionFeatures):
+            return motion
+        record = self.motion(motion) if isinstance(motion, str) else motion
+        return features_from_records(self.assembly.model, record)
 
     def motion(self, name: str) -> io.MotionRecord:
         """Return a motion at the scene's frame rate; a path that the scene does not name is taken from the current folder.
@@ -64,13 +67,15 @@ class Run:
         known = name.startswith("ncs:") or name in (*a.scene.motion.files, *a.scene.motion.validation)
         return load_motion(a.scene, name if known else str(Path(name).absolute()), a.body)
 
-    def animate(self, motion: str | MotionFeatures, alpha: float = 1.0) -> np.ndarray:
+    def animate(self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0) -> np.ndarray:
         """Return garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
 
         Raises:
-            InputError: a vertex is not finite: where, and what was so first.
+            InputError: alpha is not finite; or a vertex is not: where, and what was so first.
         """
-        track = self.track(motion) if isinstance(motion, str) else motion
+        if not np.isfinite(alpha):
+            raise InputError("a finite number expected", field="alpha", value=alpha)
+        track = self.track(motion)
         a = self.assembly
         x = animated(a.model, a.network, self.params, track, alpha)
         if not np.isfinite(np.sum(x)):
@@ -81,13 +86,13 @@ class Run:
             )
         return x
 
-    def compressed(self, motion: str | MotionFeatures, *, rank: int = 0, bfloat16: bool = False) -> Run:
+    def compressed(self, motion: str | io.MotionRecord | MotionFeatures, *, rank: int = 0, bfloat16: bool = False) -> Run:
         """Return this garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.
 
         Raises:
             InputError: the motion has no such rank.
         """
-        a, track = self.assembly, self.track(motion) if isinstance(motion, str) else motion
+        a, track = self.assembly, self.track(motion)
         try:
             network, params = compress(a.network, self.params, a.model, track, rank=rank, bfloat16=bfloat16)
         except ValueError as fault:
@@ -133,10 +138,12 @@ class Run:
             what = "the run's own terms are needed to measure its energies"
             raise InputError(what, field="terms", value=self.lacking, mend=mend)
 
-    def evaluate(self, motion: str | MotionFeatures, alpha: float = 1.0, *, exact: bool = True) -> dict[str, np.ndarray]:
+    def evaluate(
+        self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0, *, exact: bool = True
+    ) -> dict[str, np.ndarray]:
         """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
         self.check_terms()
-        track = self.track(motion) if isinstance(motion, str) else motion
+        track = self.track(motion)
         return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
 
 

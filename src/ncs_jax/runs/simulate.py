@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.energies.inertia import out_of_balance
 from ncs_jax.energies.terms import OwnTerm, StepInputs
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import skin
 from ncs_jax.io.tables.npz import read_npz, write_npz
@@ -74,7 +74,7 @@ def _turned(model: Model, turn) -> Array:
 
     def energy(x):
         step = StepInputs(vertex_transforms=transforms)
-        return sum(energies(x, garment, model.material, step, terms).values(), start=jnp.zeros((), x.dtype))
+        return sum(energy_terms(x, garment, model.material, step, terms).values(), start=jnp.zeros((), x.dtype))
 
     return out_of_balance(jax.grad(energy)(skin(transforms, rest)), model.material.density * garment.mesh.vertex_area)
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
-from ncs_jax.errors import InputError, required
+from ncs_jax.errors import InputError, required, shaped
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Correctives, Skeleton, blend, corrected, skin, to_rest_axes
 
@@ -148,6 +148,18 @@ def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lane
 
 @jax.jit
 def local_rotations(model: Model, poses: Float[Array, "*frames all 3"]) -> Float[Array, "*frames joints 3 3"]:
-    """Return local rotation matrices of the joints that matter, along the axes at rest, from axis-angle poses of all."""
+    """Return local rotation matrices of the joints that matter, along the axes at rest.
+
+    Args:
+        poses: axis-angle (rad) of all joints of the body's file, as a `MotionRecord` of the body has them.
+
+    Raises:
+        InputError: they are of another skeleton.
+    """
+    least = max(model.source_joints) + 1
+    if poses.shape[-2:-1] < (least,):
+        what = f"poses (*frames, joints, 3) of all joints of the body's file, {least} or more, expected"
+        raise InputError(what, field="poses", value=f"shape {poses.shape}")
+    shaped(poses, (3,), "poses", "axis-angle (*frames, joints, 3), rad,")
     local = axis_angle_to_matrix(poses[..., np.asarray(model.source_joints), :])
     return local if model.rest_rotations is None else to_rest_axes(local, model.rest_rotations)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import contact_force
-from ncs_jax.errors import required
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import blend, skin, unpose
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
@@ -82,7 +83,7 @@ def frame_inputs(
     """Return what the energies of a frame of a motion read, all that the model's terms ask for.
 
         step = frame_inputs(model, track, 12, previous, before)
-        parts = energies(x, model.garment, model.material, step, model.terms, model.surface)
+        parts = energy_terms(x, model.garment, model.material, step, model.terms, model.surface)
 
     Args:
         model: of a scene, such as `assembly.model`.
@@ -92,8 +93,11 @@ def frame_inputs(
         before: the garment two frames before, x_{t-2}, m; else that of the frame before, a garment that was at rest.
 
     Raises:
-        InputError: a term asks for the past, and there is none.
+        InputError: a term asks for the past, and there is none; or the track has no such frame.
     """
+    frames = len(track.start)
+    if not isinstance(frame, jax.core.Tracer) and not 0 <= int(frame) < frames:
+        raise InputError(f"a frame from 0 to {frames - 1} expected", field="frame", value=int(frame))
     unposed, terms = None, model.terms
     if terms.inertia or terms.friction or terms.own:
         previous = required(previous, "previous", "give the garment in the frame before, seen from track.origin, m")

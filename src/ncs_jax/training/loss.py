@@ -10,7 +10,7 @@ from jax import lax
 
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.geometry.skinning import Blend, blend
 from ncs_jax.network.methods.method import Method, Offsets, Windows, decode, garment_blend
 from ncs_jax.scene.features import MotionFeatures
@@ -71,7 +71,7 @@ def _through_time(model: Model, weights: Blend, offsets, matrices, moving):
     def value(earlier, weights):
         past = (pose_garment(model, earlier[k], matrices[1 + k], weights) for k in (0, 1))
         step = StepInputs(1 / model.fps, *past, moving=moving)
-        return jnp.sum(energies(x, model.garment, model.material, step, terms)["inertia"])
+        return jnp.sum(energy_terms(x, model.garment, model.material, step, terms)["inertia"])
 
     return jax.grad(value, argnums=(0, 1))(list(offsets[1:]), weights)
 

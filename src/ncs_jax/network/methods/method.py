@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.errors import required
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import Blend
 from ncs_jax.network.decoder import Decoder, merge
 from ncs_jax.scene.descriptors import DESCRIPTORS
@@ -185,6 +185,8 @@ def decode(
 ) -> Float[Array, "verts 3 *frames"]:
     """Return offsets in unposed space, m: those of the code, with a run of an earlier version those of a swing beside them."""
     offsets = jnp.asarray(network.decoder.apply({"params": params["decoder"]}, code, model.basis))
+    if offsets.shape != (expected := (len(model.basis), 3, *code.shape[:-1])):
+        raise InputError(f"offsets {expected} expected: vertices, axes, poses", field="decoder", value=f"shape {offsets.shape}")
     if swing is None or (vibrations := required(model.vibrations, "model.vibrations")).slope is not None:
         return offsets
     return offsets + jnp.tensordot(vibrations.directions, swing, (-1, -1))

@@ -19,7 +19,7 @@ from ncs_jax.energies.contact.smooth import Quadrics, nearby_quadrics
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import StepInputs, Terms
-from ncs_jax.energies.total import energies
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import required
 from ncs_jax.scene.model import Model
 from ncs_jax.simulation.solver.cholesky import Elimination, factorise
@@ -132,7 +132,7 @@ def dot(a, b):
 def energy(problem: Problem, x: Float[Array, "verts 3"]) -> Float[Array, ""]:
     """Return what a frame minimises, J."""
     model = problem.model
-    parts = energies(x, model.garment, model.material, problem.step, problem.terms, model.surface)
+    parts = energy_terms(x, model.garment, model.material, problem.step, problem.terms, model.surface)
     return sum(parts.values(), start=jnp.zeros((), x.dtype))
 
 
