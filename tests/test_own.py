@@ -155,3 +155,71 @@ def test_a_network_of_ones_own(folder, tmp_path, plain_jax):
         ncs_jax.load_run(tmp_path / "run")
     again = ncs_jax.load_run(tmp_path / "run", network=plain)
     np.testing.assert_array_equal(again.animate(motion), run.animate(motion))
+
+
+def test_a_term_of_the_velocity_is_told_that_there_is_no_past(trained, plain_jax):
+    """A swing and PBNS train on static energies: what subtracts the past there would be a TypeError of JAX's."""
+
+    def drag(x, step):
+        return jnp.sum((x - step.previous) ** 2)
+
+    model = trained.assembly.model
+    alone = Terms(None, bending=False, collision=None, gravity=False, inertia=False, own=(drag,))
+    rest = model.garment.mesh.rest
+    with pytest.raises(InputError, match=r"terms: drag: .*step\.previous.*network\.cell = 'gated'"):
+        energy_terms(rest, model.garment, model.material, StepInputs(), alone)
+    parts = energy_terms(rest, model.garment, model.material, StepInputs(1 / 30, rest, rest), alone)
+    assert float(parts["drag"]) == 0
+
+    def wrong(x, step):
+        return None - x
+
+    with pytest.raises(TypeError):  # a mistake of another kind stays what it is
+        energy_terms(rest, model.garment, model.material, StepInputs(1 / 30, rest, rest), replace(alone, own=(wrong,)))
+
+
+def test_arrays_of_another_shape_are_refused_before_they_give_numbers(folder, trained, plain_jax):
+    """Indices beyond an array are clipped in JAX: each of these would give finite, wrong numbers."""
+    model, network = trained.assembly.model, trained.assembly.network
+    init, step = ncs_jax.stepper(model, network, trained.params)
+    track = trained.track(str(folder / "swing.npz"))
+    joints, frames, verts = len(model.skeleton.parents), len(track.start), len(model.basis)
+    eye, root = jnp.broadcast_to(jnp.eye(3), (joints, 3, 3)), jnp.zeros(3)
+    step(init(), eye, root)
+    garment = np.zeros((frames, verts, 3))
+    for wrong, match in {
+        lambda: step(init(), eye[:-1], root): "rotations",
+        lambda: step(init(), eye[None], root[None]): r"rotations.*init\(number of characters\)",
+        lambda: step(init(2), eye, root): r"rotations.*init\(\) for one",
+        lambda: step(init(), eye[..., 0], root): "rotations",
+        lambda: step(init(), eye.astype(int), root): "rotations: floating-point",
+        lambda: step(init(), eye, root[:1]): "translation",
+        lambda: ncs_jax.local_rotations(model, jnp.zeros((4, max(model.source_joints), 3))): "poses",
+        lambda: ncs_jax.frame_inputs(model, track, frames): "frame: a frame from 0",
+        lambda: ncs_jax.measure(model, garment[:, 1:], track): "vertices",
+        lambda: ncs_jax.measure(model, np.zeros((frames + 1, verts, 3)), track): "vertices",
+        lambda: ncs_jax.total(
+            jnp.asarray(garment, jnp.float32), model.garment, model.material, StepInputs(), Terms()
+        ): "x: positions.*jax.vmap",
+        lambda: trained.animate(track, float("nan")): "alpha",
+    }.items():
+        with pytest.raises(InputError, match=match):
+            wrong()
+
+
+def test_a_decoder_with_axes_in_another_order_is_named(folder, plain_jax):
+    class Turned(Plain):
+        @nn.compact
+        def __call__(self, code, basis):
+            return nn.Dense(3 * self.verts)(code).reshape(*code.shape[:-1], self.verts, 3)
+
+    def turned(scene, model):
+        return replace(network_from(scene, model), decoder=Turned(len(model.basis)))
+
+    with pytest.raises(InputError, match=r"decoder: offsets .* vertices, axes, poses"):
+        ncs_jax.train(scene(folder), None, steps=10, network=turned)
+
+
+def test_a_motion_as_arrays_is_animated(folder, trained, plain_jax):
+    name = str(folder / "swing.npz")
+    np.testing.assert_array_equal(trained.animate(trained.motion(name)), trained.animate(name))

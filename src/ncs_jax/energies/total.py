@@ -80,10 +80,12 @@ def _friction(x, step: StepInputs, material: Material):
     return _counted(friction(x, advected, pressed, material.friction, step.dt), step.moving)
 
 
-def _check_positions(x, mesh: Mesh) -> None:
+def _mesh_of(x, mesh: Mesh) -> Mesh:
+    """Return the mesh of positions, after a check that they are of it."""
     if x.shape[:2] != mesh.rest.shape:
         what, mend = f"positions {mesh.rest.shape} or ({len(mesh.rest)}, 3, poses) expected", "use jax.vmap over a leading axis"
         raise InputError(what, field="x", value=f"shape {x.shape}", mend=mend)
+    return mesh
 
 
 def energy_terms(
@@ -108,8 +110,7 @@ def energy_terms(
     but for `through_time`. `elements.energies_and_gradient` is the fast path, equal to this one for every combination of terms.
     Source: slides, equation (10).
     """
-    mesh, parts = garment.mesh, {}
-    _check_positions(x, mesh)
+    mesh, parts = _mesh_of(x, garment.mesh), {}
     mass = material.density * mesh.vertex_area
     if terms.membrane is not None:
         with jax.named_scope("membrane"):
