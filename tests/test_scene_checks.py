@@ -11,6 +11,7 @@ import pytest
 
 from ncs_jax.cli import main
 from ncs_jax.prepare.scene_checks import RANGES, find_risks
+from ncs_jax.prepare.speed_checks import frames_named, thrown
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
 
@@ -118,3 +119,36 @@ def test_the_ranges_are_safe_or_refused_in_the_stability_map(quantity):
     inside = [row for row in rows if low * (1 - 1e-6) <= unit * float(row["value"]) <= high * (1 + 1e-6)]
     assert {float(row["value"]) * unit for row in inside} & {low, high}, "the map has an end of the range"
     assert [row for row in inside if row["state"] not in ("safe", "refused")] == []
+
+
+def test_a_glitch_is_named_by_its_frames_and_a_turn_that_is_none_is_not(tmp_path, plain_jax):
+    """The root half a metre aside for one frame, twice; and a path at an even pace, which no frame breaks."""
+    motion = swing()
+    motion["trans"] = np.zeros_like(motion["trans"])
+    motion["trans"][[7, 20], 0] = 0.5
+    whats = {f.what: f for f in found(tmp_path, motion=motion)}
+    assert "1.00 m" in whats["jump within a frame"].value and "frame 7, also 20" in whats["jump within a frame"].value
+    motion["trans"] = 0.2 * np.arange(len(motion["trans"]))[:, None] * [1.0, 0, 0]
+    assert not any(f.what.startswith("jump") for f in found(tmp_path, motion=motion))
+
+
+def test_frames_are_named_once_a_stretch_the_worst_first():
+    size = np.zeros(60)
+    size[[0, 1, 2, 9, 20, 21]] = 1, 1, 1, 2, 2, 3
+    assert frames_named(size, 0.5) == "frame 20, also 0, 9" and frames_named(size, 2.5) == "frame 21"
+    size[30::5] = 1
+    assert frames_named(size, 0.5) == "frame 20, also 0, 9, 30, 35, 40 and 3 more"
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+def test_a_garment_is_thrown_as_its_pendulum_is(fps):
+    """Against x'' + (g / L) (x - a) = 0 for a hold that goes from 0 to V at once: A = V sqrt(L / g), at any frame rate."""
+    length, pace = 0.5, 2.0
+    t = np.arange(fps) / fps
+    path = np.zeros((len(t), 3, 3))
+    path[:, :, 0] = np.maximum(t - 0.2, 0)[:, None] * pace
+    expected = pace * np.sqrt(length / 9.81) / length
+    far = thrown(path, np.ones(3), float(fps), np.array([0.0, -9.81, 0.0]), length, 0.0)
+    assert abs(far.max() / expected - 1) < 6 / fps and not far[: fps // 6].any()
+    upward = np.roll(path, 1, axis=2)
+    assert not thrown(upward, np.ones(3), float(fps), np.array([0.0, -9.81, 0.0]), length, 0.0).any()

@@ -16,9 +16,10 @@ from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights, topology
 from ncs_jax.geometry.surface_distance import signed_distance
 from ncs_jax.io import MotionRecord
-from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms, world_axes
+from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.prepare.setting import RECURRENT, Setting
+from ncs_jax.prepare.speed_checks import speed_faults
 from ncs_jax.prepare.touchable import touchable_faces
 from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene
@@ -38,8 +39,6 @@ RANGES = {
 }
 DEEP = 0.01  # m that vertices may be inside the body, where the body alone carries the garment,
 MANY = 0.02  # and the share of the vertices that may be deeper
-JUMP = 0.3  # m within a frame: the thickness of a limb
-TURN = 90.0  # degrees within a frame
 POSES = 8  # checked in every motion
 CLEAR = 0.02  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
@@ -146,29 +145,12 @@ def _inside(
 
 
 def _motion(a: Setting, faces: np.ndarray | None, name: str) -> Iterator[Risk]:
-    """Yield the risks of a motion: how far it goes, jumps and turns within a frame, cloth inside the body."""
-    from scipy.spatial.transform import Rotation
-
-    record, model = a.motions[name], a.model
+    """Yield the risks of a motion: how far it goes, cloth inside the body."""
+    record = a.motions[name]
     path = record.translation.astype(np.float64)
     far = float(np.linalg.norm(path - path[:1], axis=1).max())
     rounding = "positions are rounded to more than 0.1 mm"
     yield from _outside("distance from the start", far, f"{far:.0f} m in {name}", rounding, "cut the motion")
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    if steps.max(initial=0) > JUMP:
-        value = f"{steps.max():.2f} m in {name}, frame {1 + int(steps.argmax())}"
-        yield Risk("jump within a frame", value, "the cloth is left behind, then torn along", "cut the motion there")
-    axes = None if model.rest_rotations is None else np.asarray(model.rest_rotations, np.float64)
-    local = world_axes(record.poses[:, list(model.source_joints)], axes)
-    if len(local) > 1:
-        turns = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
-        turn = np.degrees(Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()).reshape(turns.shape[:2])
-        if turn.max() > TURN:
-            frame, joint = np.unravel_index(turn.argmax(), turn.shape)
-            number = model.source_joints[joint]
-            label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
-            value = f"{turn.max():.0f} degrees in {name}, frame {frame + 1}, joint {label}"
-            yield Risk("turn within a frame", value, "a limb passes through cloth", "clean the motion there")
     if faces is not None:
         frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
         mend = "mend the pose, or smooth the skinning weights"
@@ -193,6 +175,7 @@ def _postures(a: Setting) -> Iterator[Risk]:
 def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
     found += [*_postures(a), *_material(a.scene), *_mesh(a)]
     faces = None
     if a.model.body is not None and a.body is not None:

@@ -1,0 +1,125 @@
+"""What is too fast in a motion for what a scene models: glitches, by their frames, and throws beyond a swing's linear range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ncs_jax.errors import required
+from ncs_jax.geometry.skinning import Blend
+from ncs_jax.io import MotionRecord
+from ncs_jax.prepare.posing import joint_transforms, world_axes
+from ncs_jax.prepare.setting import Setting
+
+__all__ = ["frames_named", "speed_faults", "thrown"]
+
+JUMP = 0.3  # m by which the root or skin may leave its path within a frame: the thickness of a limb
+TURN = 90.0  # degrees within a frame
+THROWN = 1.0  # of a garment's length, by which leaps and lunges throw it, and walks, runs and most dances (0.93) do not
+SEEN = 100  # points of the garment and of the body that are looked at
+NAMED = 5  # frames that are named
+
+
+def speed_faults(a: Setting, name: str) -> Iterator[tuple[str, str, str, str]]:
+    """Yield what is too fast in a motion, how much and in which frames, what that does, and what mends it."""
+    record = a.motions[name]
+    yield from _jumps(a, name, record)
+    yield from _turns(a, name, record)
+    scene = a.scene
+    if a.body is None or not (scene.network.method == "ncs" and scene.network.cell == "swing" and scene.physics.inertia):
+        return
+    mesh, gravity = a.model.garment.mesh, np.array(scene.physics.gravity)
+    rest, mass = np.asarray(mesh.rest, np.float64), np.asarray(mesh.vertex_area, np.float64)
+    some = _some(len(rest))
+    path = _paths(a, record, rest[some], a.model.blend, some)
+    up = np.abs(gravity).argmax()
+    far = thrown(path, mass[some], record.fps, gravity, float(np.ptp(rest[:, up])), scene.network.damping)
+    if far.max() > THROWN:
+        value = f"the garment thrown aside by {far.max():.2f} of its length in {name}, {frames_named(far, THROWN)}"
+        risk = "the swing is shortened to its linear range: it lags, and cloth is stretched"
+        yield "fast motion", value, risk, f"slow or smooth the motion there, or leave the frames out: {name}[0:60]"
+
+
+def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
+    """Return how far a motion throws a garment aside in every frame, r.m.s. over it, in its own lengths L.
+
+        q'' + c q' + (g / L) q = -a_t,   sqrt(mean |q|^2) / L
+
+    It is what a pendulum of the garment's length does, by implicit Euler from rest, that is hung up where the body carries each
+    point. a_t is that point's acceleration across gravity: what is along it stretches cloth, and does not swing it.
+
+    Args:
+        path: (frames, points, 3) as the body carries the garment, m. mass: (points,). damping: c, 1/s.
+    """
+    pull = float(np.linalg.norm(gravity))
+    if not pull or not length:
+        return np.zeros(len(path))
+    h, down, square = 1 / fps, gravity / pull, pull / length
+    begun = np.concatenate([path[:1], path[:1], path])
+    push = -(begun[2:] - 2 * begun[1:-1] + begun[:-2]) / h**2
+    push -= (push @ down)[..., None] * down
+    q, rate, far = np.zeros(path.shape[1:]), np.zeros(path.shape[1:]), np.zeros(len(path))
+    for t, force in enumerate(push):
+        rate = (rate + h * (force - square * q)) / (1 + h * damping + h * h * square)
+        q = q + h * rate
+        far[t] = np.sqrt(np.average(np.sum(q * q, axis=-1), weights=mass)) / length
+    return far
+
+
+def frames_named(size: np.ndarray, limit: float) -> str:
+    """Return as words in which frames a size (frames,) is beyond its limit: where the worst stretch begins, then the others."""
+    bad = size > limit
+    first = np.flatnonzero(bad & ~np.concatenate([[False], bad[:-1]]))
+    worst = int(first[first <= size.argmax()][-1])
+    others = [str(frame) for frame in first if frame != worst]
+    more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+    return f"frame {worst}" + (f", also {', '.join(others[:NAMED])}{more}" if others else "")
+
+
+def _jumps(a: Setting, name: str, record: MotionRecord) -> Iterator[tuple[str, str, str, str]]:
+    """Yield a fault where the root, or skin that the garment can touch, leaves its straight path within a frame."""
+    path = record.translation.astype(np.float64)[:, None]
+    if a.body is not None and a.model.body is not None:
+        skin = np.asarray(a.model.body, np.float64)
+        some = _some(len(skin))
+        path = np.concatenate(
+            [path, _paths(a, record, skin[some], required(a.model.body_blend, "model.body_blend"), some)], axis=1
+        )
+    begun = np.concatenate([path[:1], path[:1], path])
+    away = np.linalg.norm(begun[2:] - 2 * begun[1:-1] + begun[:-2], axis=-1).max(axis=1)
+    if away.max() > JUMP:
+        value = f"{away.max():.2f} m in {name}, {frames_named(away, JUMP)}"
+        yield "jump within a frame", value, "the cloth is left behind, then torn along", "clean or cut the motion there"
+
+
+def _turns(a: Setting, name: str, record: MotionRecord) -> Iterator[tuple[str, str, str, str]]:
+    """Yield a fault where a joint that carries the garment turns too far within a frame."""
+    from scipy.spatial.transform import Rotation
+
+    model = a.model
+    axes = None if model.rest_rotations is None else np.asarray(model.rest_rotations, np.float64)
+    local = world_axes(record.poses[:, list(model.source_joints)], axes)
+    if len(local) < 2:
+        return
+    turns = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
+    turn = np.degrees(Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()).reshape(turns.shape[:2])
+    if turn.max() > TURN:
+        number = model.source_joints[int(turn.max(axis=0).argmax())]
+        label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
+        at = frames_named(np.concatenate([[0], turn.max(axis=1)]), TURN)
+        value = f"{turn.max():.0f} degrees in {name}, {at}, joint {label}"
+        yield "turn within a frame", value, "a limb passes through cloth", "clean the motion there"
+
+
+def _some(count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, SEEN).round().astype(int))
+
+
+def _paths(a: Setting, record: MotionRecord, rest: np.ndarray, weights: Blend, some: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Return where some vertices, at rest at `rest`, are in every frame (frames, points, 3), m, as the body carries them."""
+    transforms = joint_transforms(required(a.body, "body"), record.poses)[:, list(a.model.source_joints)][
+        :, list(weights.joints)
+    ]
+    blended = np.einsum("vj,tjab->tvab", np.asarray(weights.weights, np.float64)[some], transforms, optimize=True)
+    return np.einsum("tvab,vb->tva", blended[..., :3], rest) + blended[..., 3] + record.translation.astype(np.float64)[:, None]
