@@ -293,6 +293,19 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     resumed = train(scene, tmp_path / "run", resume=True, report=reports.append)
     assert reports[-1].step == 40 and not reports[-1].message  # it moves
     jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
+    _refuse_an_earlier_swing(scene, tmp_path / "run")
+
+
+def _refuse_an_earlier_swing(scene, folder):
+    """Without a slope it was trained to add its swing to the cloth: it is animated, and neither resumed nor begun from."""
+    with np.load(folder / "prepared.npz") as kept:
+        arrays = {name: kept[name] for name in kept if name != "slope"}
+    np.savez(folder / "prepared.npz", **arrays)
+    assert load_run(folder).assembly.model.vibrations.slope is None
+    for how in ({"out": folder, "resume": True}, {"start": folder}):
+        with pytest.raises(InputError, match="a swing of this version expected") as fault:
+            train(scene, steps=80, **how)
+        assert fault.value.file == str(folder) and "slope" in fault.value.field and "anew" in fault.value.mend
 
 
 def test_a_run_of_an_earlier_version_still_loads(tmp_path, plain_jax):

@@ -75,14 +75,11 @@ def facts_of_run(out: Path | None, resume: bool) -> dict | None:
     return read_run(out)
 
 
-def _check_swing(out: Path) -> None:
-    """Raise an InputError where the run to resume has the swing of an earlier version, which is trained no more."""
-    if not (out / "prepared.npz").exists():  # killed before it was written
-        return
-    kept = read_prepared(out)
+def _check_swing(kept: Prepared, run: str) -> None:
+    """Raise an InputError where a run has the swing of an earlier version, which is trained no more."""
     if kept.vibrations.size and not kept.slope.size:
-        mend = "train into a new folder; what this one has learned can still be animated"
-        raise InputError("a swing of this version expected", file=out / "prepared.npz", field="slope", mend=mend)
+        mend = "train anew into a new folder; what this run has learned can still be animated"
+        raise InputError("a swing of this version expected", file=run, field="prepared.npz: slope", mend=mend)
 
 
 def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps: int | None) -> Scene:
@@ -102,7 +99,8 @@ def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps:
             f"at least the {done} steps that the run has expected", file=out, field="steps", value=steps, mend=mend
         )
     kept = scene_from(facts["scene"], source=str(out / "run.json"))
-    _check_swing(out)
+    if (out / "prepared.npz").exists():  # else it was killed before that was written
+        _check_swing(read_prepared(out), str(out))
     chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
     chosen |= {"network.cell"} if scene.network.cell == "auto" else set()
     other = [what for what in _differences(kept.to_dict(), scene.to_dict()) if what not in chosen]
@@ -138,6 +136,7 @@ def _assemble_started(
     run = start if isinstance(start, Run) else load_run(start, network=network)
     name = "a run" if isinstance(start, Run) else str(start)
     before = run.assembly
+    _check_swing(before.prepared, name)
     if scene.network.cell == "auto":
         scene = replace(scene, network=replace(scene.network, cell=before.scene.network.cell))
     if network is None:
