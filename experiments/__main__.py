@@ -27,8 +27,8 @@ FALLS = 10_000
 
 
 # Until the study is made again: what of its tables is of code that has changed since.
-EARLIER = """- **Not of this version:** rows of a swing (`ncs`, "the garment's own vibrations", and every section whose scene swings) were
-  measured when the swing was added to the cloth and had no bound. `python -m experiments.fast_motion` measures the one of today.
+EARLIER = """- **Not of this version:** rows of a swing (`ncs`, "the garment's own vibrations") were
+  measured when the swing was added to the cloth and had no bound. That of today: `python -m experiments.fast_motion`.
 """
 
 

@@ -1,6 +1,6 @@
 """Fast motion: a swing beside a gated unit and beside itself without swing, on what people and recordings do at their fastest.
 
-    python -m experiments.fast_motion [SCENE] [--steps 300] [--seeds 2] [--quick] [--out runs/fast_motion]
+    python -m experiments.fast_motion [SCENE] [--steps 200] [--seeds 2] [--quick] [--out runs/fast_motion]
 
 Two trainings of each cell and seed: on the fast clips themselves (`CLIPS`), and on the scene's motions alone, to which every
 fast clip is new. Each is rolled out on every clip: energy, its worst frame, strain, share inside the body. Writes
@@ -23,6 +23,7 @@ from ncs_jax.io.packaged import packaged
 from ncs_jax.io.tables.npz import write_npz
 from ncs_jax.metrics.quality import measure
 
+SCENE = Path(__file__).with_suffix(".toml")
 FPS, FRAMES = 30, 75
 BEGIN = 15  # the frame in which a clip begins to move
 FIRST = 50  # steps in which a burst of energy would show
@@ -206,8 +207,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="fast_motion", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scene", nargs="?", default="ncs:skirt", help="scene file, or ncs:NAME (default: ncs:skirt)")
-    parser.add_argument("--steps", type=int, default=300, help="of every training (default: 300)")
+    parser.add_argument("scene", nargs="?", default=SCENE, help="scene file, or ncs:NAME (default: fast_motion.toml beside it)")
+    parser.add_argument("--steps", type=int, default=200, help="of every training (default: 200)")
     parser.add_argument("--seeds", type=int, default=2, help="of every training (default: 2)")
     parser.add_argument("--clips", nargs="+", choices=CLIPS, default=tuple(CLIPS), help="which (default: all)")
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, help="what to train on (default: both)")

@@ -15,6 +15,7 @@ from experiments import (
     control,
     descriptors,
     falling,
+    fast_motion,
     fit_material,
     membranes,
     methods,
@@ -26,6 +27,8 @@ from experiments import (
     study,
 )
 from ncs_jax import InputError, assemble
+from ncs_jax.io import read_body
+from ncs_jax.io.packaged import packaged
 
 from .scenes import FREE, SCENE, swing, write_scene
 
@@ -109,6 +112,28 @@ def studied(module, tmp_path, *more, text=SCENE):
     assert told.endswith(".") and "nan" not in told
     assert module.main([str(tmp_path / "nowhere.toml")]) == 2
     return {next(iter(row.values())): row for row in rows}
+
+
+def test_fast_clips_begin_at_rest_and_are_as_fast_as_they_say(tmp_path):
+    files = fast_motion.clips(tmp_path, read_body(packaged("body")))
+    for name, file in files.items():
+        with np.load(file) as clip:
+            poses, path = clip["poses"], clip["trans"]
+        assert len(poses) == len(path) == fast_motion.FRAMES and np.isfinite(poses).all(), name
+        still = np.ptp(poses[:3], axis=0).max() + np.ptp(path[:3], axis=0).max()
+        assert name == "dance" or still == 0, name
+    with np.load(files["stop"]) as clip:
+        steps = np.diff(clip["trans"][:, 2]) * fast_motion.FPS
+    np.testing.assert_allclose([steps.min(), steps.max()], [0, 3], atol=1e-6)
+
+
+@pytest.mark.slow  # nearly all of it is compiling
+def test_fast_motion(tmp_path):
+    assert fast_motion.main(["--quick", "--clips", "stop", "--sets", "them", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "fast_motion.csv").open() as file:
+        rows = {row["cell"]: row for row in csv.DictReader(file)}
+    assert list(rows) == ["gated", "swing", "swing, alpha = 0"] and all(float(row["energy"]) > 0 for row in rows.values())
+    assert float(rows["swing"]["stopped"]) > 0 and fast_motion.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
 def test_the_page_is_what_its_tables_say():
