@@ -185,7 +185,7 @@ def experiment(
         for cell in cells:
             some: dict[tuple[str, str], list[dict]] = {}
             for seed in range(seeds):
-                table = {"motion": {"files": motions, "validation": ()}, "training": {"seed": seed}}
+                table: dict[str, dict] = {"motion": {"files": motions, "validation": ()}, "training": {"seed": seed}}
                 one = changed(scene, network={"cell": cell}, **table)
                 run, first = trained(one, steps)
                 for name, file in files.items():
