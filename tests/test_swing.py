@@ -15,7 +15,7 @@ from ncs_jax.energies.total import total
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.network.methods.swing import QUIET, Swing
 from ncs_jax.network.rollout import stepper
-from ncs_jax.prepare.build import features_from_records
+from ncs_jax.prepare.build import BEYOND, features_from_records
 from ncs_jax.prepare.setting import with_cell
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
@@ -131,6 +131,19 @@ def test_no_acceleration_brings_a_swing_beyond_its_range(size):
     assert size < 10 or rms_slope(model, q).max() > 0.7
     free = replace(model, vibrations=replace(model.vibrations, slope=0 * model.vibrations.slope))
     assert size < 100 or rms_slope(model, np.asarray(swings(network, params, free, track))).max() > 2
+
+
+def test_the_range_of_a_swing_is_that_of_its_training_and_half_as_much_more():
+    """W of the training's largest swing is 1 / 1.5^2, of one that is shortened itself; no motion is swung beyond the range."""
+    assembly, _, motion = ready(method="swing")
+    model, network = assembly.model, assembly.network
+    params, given = initial_state(model, network, 0).params, model.vibrations
+    learned = given.slope - _slope(model.garment.mesh, np.asarray(given.directions))
+    q = np.asarray(swings(network, params, model, assembly.track))
+    largest = np.sqrt(np.einsum("tk,kl,tl->t", q, learned, q)).max()
+    assert 0.85 < BEYOND * largest < 1.01
+    faster = features_from_records(model, edited(motion, translation=10 * motion.translation))
+    assert rms_slope(model, q).max() < rms_slope(model, np.asarray(swings(network, params, model, faster))).max() < 1
 
 
 def test_a_small_swing_is_linear_and_a_large_one_only_loses_energy():

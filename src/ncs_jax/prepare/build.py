@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float
 from ncs_jax import io
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
-from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.method import Method, initial_parameters
+from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
@@ -26,6 +28,8 @@ from ncs_jax.scene.spec import Scene
 
 __all__ = ["Assembly", "build", "features_from_records"]
 
+BEYOND = 1.5  # times as far as in training may a swing go
+LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
 CELL = 8.0  # m; side of the grid from whose corners motions are measured
 
 
@@ -113,10 +117,29 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
         modes = softest_ritz_modes(model, track, count)
         if modes is None:
             return None
-        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": modes.slope}
+        slope = _range(scene, replace(model, vibrations=modes), track)
+        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope}
         return {name: np.asarray(array) for name, array in arrays.items()}
 
-    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, model, track, count) or {}))
+    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, model, track, str(scene.network)) or {}))
+
+
+def _range(scene: Scene, model: Model, track: MotionFeatures) -> np.ndarray:
+    """Return what bounds a swing, S + W (modes, modes): its linear range, and what the training motions show a network of it.
+
+        W = C^-1 / (b^2 max_t q_t^T C^-1 q_t),   C = mean q q^T + e tr(mean q q^T) / modes I,   b = BEYOND,   e = LEAST
+
+    q are the training's swings of the garment that a fresh network gives, next to that of skinning. One that is b times as
+    far as any of them has q^T W q = 1, by how far they go in its own direction.
+    """
+    network, vibrations = network_from(scene, model), required(model.vibrations, "vibrations")
+    params = initial_parameters(network, jax.random.PRNGKey(0), model)
+    q = np.asarray(jax.jit(Swing.swings, static_argnums=0)(network, params, model, track), np.float64)
+    spread, slope = q.T @ q / len(q), np.asarray(vibrations.slope, np.float64)
+    if not spread.any():
+        return slope
+    inverse = np.linalg.inv(spread + LEAST * np.trace(spread) / len(spread) * np.eye(len(spread)))
+    return slope + inverse / (BEYOND**2 * np.einsum("tk,kl,tl->t", q, inverse, q).max())
 
 
 def _vibrations(prepared: Prepared, dtype) -> RitzModes:

@@ -27,8 +27,9 @@ class RitzModes:
     """Movements of a garment about its drape, in unposed space: see `ritz_modes.softest_ritz_modes`.
 
     directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
-    slope: the garment's mean of the displacement gradients' products, grad d_k : grad d_l, so that a movement D q turns and
-    strains it by sqrt(q^T slope q), r.m.s.; None in a run of an earlier version, whose swing has no bounds.
+    slope: what bounds a swing q, by q^T slope q: the garment's mean of the displacement gradients' products, grad d_k : grad
+    d_l, of which the root is how much it turns and strains, r.m.s.; and what training shows of it, see `methods.swing`. None
+    in a run of an earlier version, whose swing has no bounds.
     """
 
     directions: Float[Array, "verts 3 modes"]

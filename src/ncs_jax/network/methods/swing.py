@@ -146,12 +146,14 @@ class Swing:
         return lax.scan(step, (zero, zero), (inverse, g, g1, g2, push, number == track.start), unroll=4)[1]
 
     def bounded(self, model: Model, q: Float[Array, "modes *poses"]) -> Float[Array, "modes *poses"]:
-        """Return a swing that is shorter where it is beyond the linear range: r.m.s. displacement gradients of one, 45 degrees.
+        """Return a swing that is shorter where it is beyond the linear range, or beyond what was trained.
 
-            q / (1 + n^4)^(1/4),   n^2 = q^T S q,   S_kl = mean of grad d_k : grad d_l over the garment
+            q / (1 + n^4)^(1/4),   n^2 = q^T (S + W) q,   S_kl = mean of grad d_k : grad d_l over the garment
 
-        Half of the range is shortened by 1.5 %, and no acceleration brings a swing beyond it. It only takes energy away, like
-        an inelastic stop: E_0 |q|^2 / 2 falls, and what is carried to the next frames is the shorter swing.
+        q^T S q is one at r.m.s. displacement gradients of 45 degrees, q^T W q at 1.5 times the farthest that the training
+        motions swing, in its own direction: a network is not asked for what no training has shown it. S + W is kept as
+        `RitzModes.slope`. Half of the range is shortened by 1.5 %, and no acceleration brings a swing beyond it. It only takes
+        energy away, like an inelastic stop: E_0 |q|^2 / 2 falls, and what is carried to the next frames is the shorter swing.
         """
         slope = _vibrations(model).slope
         if slope is None:
