@@ -38,7 +38,7 @@ def speed_faults(a: Setting, name: str) -> Iterator[tuple[str, str, str, str]]:
     if far.max() > THROWN:
         value = f"the garment thrown aside by {far.max():.2f} of its length in {name}, {frames_named(far, THROWN)}"
         risk = "the swing is shortened to its linear range: it lags, and cloth is stretched"
-        yield "fast motion", value, risk, f"slow or smooth the motion there, or leave the frames out: {name}[0:60]"
+        yield "fast motion", value, risk, "slow or smooth the motion there, or leave the frames out: FILE[FIRST:STOP]"
 
 
 def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
