@@ -16,7 +16,7 @@ import pytest
 from ncs_jax.cli import parser
 from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import surface_from
-from ncs_jax.geometry.surface_distance import closest_on_surface, signed_distance
+from ncs_jax.geometry.surface_distance import closest_on_surface, distance_and_direction, signed_distance
 from ncs_jax.prepare.kept import kept
 from ncs_jax.simulation.ritz_modes import _Band
 
@@ -91,6 +91,15 @@ def test_distances_on_the_host_are_those_of_the_program():
     far = near == 0.05
     assert 50 < far.sum() < 350 and (expected[far] > 0).all()
     np.testing.assert_allclose(near[~far], expected[~far], atol=1e-12)
+    away = np.asarray(jax.jit(jax.grad(lambda x: nearest_distance(x, jnp.asarray(body), surface).sum()))(jnp.asarray(x)))
+    same, lead = distance_and_direction(x, body, faces, border)
+    np.testing.assert_array_equal(same, found)
+    np.testing.assert_allclose(lead, away, atol=1e-9)
+    ahead = distance_and_direction(body[faces].mean(axis=1), body, faces, border)[1]
+    corner = body[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    size = np.linalg.norm(normal, axis=1)
+    assert (np.sum(ahead * normal, axis=1) > 0.999 * size)[size > 0].all()  # on the surface itself
 
 
 def test_the_closest_point_is_on_its_triangle():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,9 +47,8 @@ def add_commands(commands) -> None:
     parser.add_argument(
         "--clearance",
         type=arguments.positive,
-        default=0.004,
         metavar="M",
-        help="distance to keep from the body, metres (default: 0.004)",
+        help="distance to keep from the body, metres (default: found, so that no skin shows between vertices)",
     )
 
 
@@ -81,7 +81,7 @@ def fit(options) -> int:
     _say_what(found, given)
     io.write_garment(out, found.garment)
     _draw(picture, body, given.faces, {"placed": placement.garment.vertices, "out of the body": found.garment.vertices})
-    text = _scene(options, out, found.garment, body)
+    text = _scene(options, out, found, body)
     print(f"wrote {out} and {picture}")
     file = out.with_suffix(".toml")
     if file.exists():
@@ -122,6 +122,7 @@ def _say_what(found, given) -> None:
     print(f"  body      {(before > 0).sum()} vertices were inside, up to {1000 * max(before.max(), 0):.1f} mm; ", end="")
     print(f"{(pushed > 0.01).sum()} moved, by {pushed.max():.1f} mm at most; {(after > 0).sum()} inside now")
     print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
+    _say_contact(found.contact)
     print(f"  surface   connected components {parts.components}, degenerate triangles {parts.degenerate}")
     for loop in sorted(boundary_loops(g.faces), key=lambda loop: -x[loop, 1].mean()):
         long = np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()
@@ -136,6 +137,18 @@ def _say_what(found, given) -> None:
     print("  weights   " + ("the file's own" if given.weights is not None else spread))
 
 
+def _say_contact(contact) -> None:
+    """Print the thickness and stiffness of the scene's collision, and why they are what they are."""
+    thick, sunk, pressed, edge = (1000 * a for a in (contact.thickness, contact.sinking, contact.pressed, contact.edge))
+    print(f"  contact   thickness {thick:g} mm, stiffness {contact.stiffness:g}: triangles of {edge:.0f} mm, laid on the skin,")
+    print(
+        f"            sink {sunk:.1f} mm into its curves, and their load presses them {pressed:.1f} mm; the rest is for motion"
+    )
+    if contact.thickness < contact.least:
+        least = math.ceil(1000 * contact.least) / 1000
+        print(f"            too thin, skin will show: give --clearance {least:g} or more, or a finer mesh")
+
+
 def _draw(picture: Path, body, faces: np.ndarray, cloths: dict[str, np.ndarray]) -> None:
     """Draw a garment on the body, once for each label."""
     import numpy as np
@@ -148,7 +161,7 @@ def _draw(picture: Path, body, faces: np.ndarray, cloths: dict[str, np.ndarray])
     contact_sheet(picture, animation, frames=len(cloths), labels=tuple(cloths))
 
 
-def _scene(options, out: Path, garment, body) -> str:
+def _scene(options, out: Path, found, body) -> str:
     """Return a whole scene for the fitted garment: with the packaged motions where the body's joints can be told apart."""
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.joint_names import anatomy
@@ -157,7 +170,7 @@ def _scene(options, out: Path, garment, body) -> str:
     names = body_names(body)
     moved = names and anatomy(names, body.parents).roles.keys() >= LIMBS
     lines = [arguments.body_table(options, out.parent), "", "[garment]", f"file = {json.dumps(out.name)}"]
-    lines += [f'pins = "{PINS}"'] if PINS in garment.groups else []
+    lines += [f'pins = "{PINS}"'] if PINS in found.garment.groups else []
     lines += ["", "[motion]"]
     if moved:
         lines += [f"files = {json.dumps([f'ncs:{name}' for name in MOTIONS])}", 'validation = ["ncs:mixed"]', "fps = 30"]
@@ -165,6 +178,9 @@ def _scene(options, out: Path, garment, body) -> str:
         lines += [
             "files = []  # the names of its joints do not tell how packaged motions move them: name its own, say walk.fbx"
         ]
-    lines += ["", "[physics.collision]", f"thickness = {options.clearance:g}"] if options.clearance != 0.004 else []
+    contact, usual = found.contact, Scene().physics.collision
+    told = [f"{n} = {getattr(contact, n):g}" for n in ("thickness", "stiffness") if getattr(contact, n) != getattr(usual, n)]
+    told = [f"{told[0]}  # for edges of {1000 * contact.edge:.0f} mm, else skin shows between them", *told[1:]] if told else []
+    lines += ["", "[physics.collision]", *told] if told else []
     lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]
     return "\n".join(lines) + "\n"

@@ -9,7 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SurfacePoints", "closest_on_surface", "signed_distance"]
+from ncs_jax.geometry.mesh import topology
+
+__all__ = ["SurfacePoints", "border_of", "closest_on_surface", "distance_and_direction", "signed_distance"]
 
 SAME = 1e-9  # m; triangles whose distances differ by less share the closest point
 
@@ -124,13 +126,40 @@ def signed_distance(
     some = np.flatnonzero(np.sum((x - vertices[near]) * normals[near], axis=1) < clear)
     if not some.size:
         return distance
-    points = closest_on_surface(x[some], vertices, faces)
+    distance[some], _ = _signed(x[some], vertices, faces, border, normals)
+    return distance
+
+
+def border_of(faces: np.ndarray, count: int) -> np.ndarray:
+    """Return which of `count` vertices are on the rim of a mesh: they end an edge of one triangle alone."""
+    edges, sides, _ = topology(faces)
+    border = np.zeros(count, bool)
+    border[edges[sides[:, 1] < 0]] = True
+    return border
+
+
+def distance_and_direction(
+    x: np.ndarray, vertices: np.ndarray, faces: np.ndarray, border: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `signed_distance` (N,), m, and its gradient (N, 3): the unit vectors that lead away from the surface.
+
+    On the surface itself, within 1e-9 m, that is the pseudo-normal. Arguments as of `signed_distance`.
+    """
+    vertices = np.asarray(vertices, np.float64)
+    return _signed(np.asarray(x, np.float64), vertices, faces, border, _vertex_normals(vertices, faces))
+
+
+def _signed(x, vertices, faces, border, normals) -> tuple[np.ndarray, np.ndarray]:
+    points = closest_on_surface(x, vertices, faces)
     zero, corner = points.weights <= 0, faces[points.face, points.weights.argmax(axis=1)]
     normal = np.where((zero.sum(axis=1) == 2)[:, None], normals[corner], points.normal)
     outside = np.sum(points.gap * normal, axis=1) >= 0
     outside |= (border[faces[points.face]] | zero).all(axis=1)
-    distance[some] = np.where(outside, 1, -1) * np.linalg.norm(points.gap, axis=1)
-    return distance
+    size = np.linalg.norm(points.gap, axis=1)
+    side, on = np.where(outside, 1.0, -1.0), size < SAME
+    away = np.where(on[:, None], normal, side[:, None] * points.gap)
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    return side * size, away / np.where(length > 0, length, 1)
 
 
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

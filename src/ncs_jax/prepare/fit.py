@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ncs_jax.energies.contact.distance import nearest_distance
-from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import adjacency, topology, with_middles
+from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.covering import Cover, contact_for, sinking
 from ncs_jax.prepare.garment_checks import FAR
 from ncs_jax.prepare.garment_placement import Placement, place
 from ncs_jax.prepare.skinning_weights import transfer_weights
@@ -39,7 +37,8 @@ class Fitted:
 
     garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. placement: where it was found to
     belong, before it was pushed out. depth: of every vertex inside the body, before and after the push, m, negative outside.
-    carried: its area that lies on what faces up, m^2. lying: share of its vertices that follow the skin.
+    carried: its area that lies on what faces up, m^2. lying: share of its vertices that follow the skin. contact: the thickness
+    and stiffness of a collision that keep the skin from showing through.
     """
 
     garment: GarmentRecord
@@ -47,26 +46,29 @@ class Fitted:
     depth: tuple[np.ndarray, np.ndarray]
     carried: float
     lying: float
+    contact: Cover
 
 
-def fit(file: str | Path, garment: GarmentRecord, body: BodyRecord, *, clearance: float = 0.004, **known) -> Fitted:
+def fit(file: str | Path, garment: GarmentRecord, body: BodyRecord, *, clearance: float | None = None, **known) -> Fitted:
     """Bring a garment onto a body: `place` it, with what is `known` of unit, axes and place, and `settle` it there."""
     return settle(file, place(file, garment, body, **known), body, clearance=clearance)
 
 
-def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float = 0.004) -> Fitted:
+def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float | None = None) -> Fitted:
     """Push a placed garment out of the body, pin and weight it. Its own group `pins` and its own weights, if any, are kept.
 
     Args:
-        file: the garment's, for errors. placement: from `place`. clearance: least distance of every vertex from the body, m.
+        file: the garment's, for errors. placement: from `place`. clearance: least distance of every vertex from the body, m;
+            None: what keeps the skin from showing between vertices, see `covering.contact_for`.
 
     Raises:
         InputError: the place is in doubt, or the garment cannot be pushed out of the body there.
     """
     placement.check(file)
     placed = placement.garment
-    before = placed.vertices
-    x = push_out(before, placed.faces, body, clearance)
+    before = placed.vertices.astype(np.float64)
+    contact = contact_for(before, placed.faces, sinking(before, placed.faces, body.vertices, body.faces), clearance)
+    x = push_out(before, placed.faces, body, contact.thickness)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
         raise InputError(
@@ -75,75 +77,71 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
             value=f"as its place {placement.options}",
             mend="look at the picture; give it the pose and size of the body in a modeller, or another place with --move",
         )  # fmt: skip
-    surface = surface_from(x, body.vertices, body.faces)
-    placed = replace(placed, vertices=x)
-    depth = tuple(-_distances(at, body, surface)[0] for at in (before, x))
-    weights, lying = spread_weights(placed, body, surface)
-    pins, carried = pins_of(placed, body, surface)
+    placed = replace(placed, vertices=x.astype(placed.vertices.dtype))
+    away = _away_from(body, placed.vertices)
+    weights, lying = spread_weights(placed, body, *away)
+    pins, carried = pins_of(placed, *away)
     groups = placed.groups if PINS in placed.groups or not len(pins) else {**placed.groups, PINS: pins}
     weights = weights if placed.weights is None else placed.weights
-    return Fitted(replace(placed, groups=groups, weights=weights), placement, (depth[0], depth[1]), carried, lying)
+    depth = -_away_from(body, before)[0], -away[0]
+    return Fitted(replace(placed, groups=groups, weights=weights), placement, depth, carried, lying, contact)
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
 
 
-@jax.jit
-def _distance(x, body, surface: Surface):
-    def total(x):
-        distance = nearest_distance(x, body, surface)
-        return jnp.sum(distance), distance
-
-    (_, distance), away = jax.value_and_grad(total, has_aux=True)(x)
-    return distance, away
-
-
-def _distances(x: np.ndarray, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def _away_from(body: BodyRecord, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the signed distance (V,) of points (V, 3) to the body, m, and the unit vectors (V, 3) that lead away from it."""
-    found = _distance(jnp.asarray(x, jnp.float32), jnp.asarray(body.vertices, jnp.float32), surface)
-    return np.asarray(found[0], np.float64), np.asarray(found[1], np.float64)
+    return distance_and_direction(x, body.vertices, body.faces, border_of(body.faces, len(body.vertices)))
 
 
 def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
     """Return vertices (V, 3) moved so that they and the middles of edges keep the clearance (m) from the body.
 
     Each round moves a vertex that is too near the body, or that ends an edge whose middle is, away from the body until it is
-    not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth.
+    not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth. A point is looked at
+    again only where it has moved by more than what it had to spare.
     """
     from scipy.sparse import diags_array
 
     edges = topology(faces)[0]
     around = adjacency(edges, len(x))
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
-    surface = surface_from(with_middles(x, edges), body.vertices, body.faces)
-    rest, held, own = x.astype(np.float64), np.zeros(len(x), bool), np.zeros(x.shape)
+    held, own = np.zeros(len(x), bool), np.zeros(x.shape)
+    seen = with_middles(x, edges)
+    distance, away = _away_from(body, seen)
     far = FAR * np.ptp(body.vertices, axis=0).max()  # a garment pushed farther is not on the body
     for _ in range(PUSHES):
         moved = own
         for _ in range(RINGS):
             moved = np.where(held[:, None], own, mean @ moved)
-        distance, away = _distances(with_middles(rest + moved, edges), body, surface)
+        points = with_middles(x + moved, edges)
+        gone = np.linalg.norm(points - seen, axis=1)
+        again = np.flatnonzero((gone > 0) & (distance - gone < clearance))
+        if again.size:
+            seen[again] = points[again]
+            distance[again], away[again] = _away_from(body, points[again])
         lacks = np.maximum(clearance - distance, 0)
-        short, away = lacks[: len(x)].copy(), away[: len(x)]
+        short = lacks[: len(x)].copy()
         np.maximum.at(short, edges, lacks[len(x) :, None])
         if short.max() <= 0.01 * clearance or np.linalg.norm(moved, axis=1).max() > far:
             break
         held |= short > 0
-        own = np.where(held[:, None], moved + short[:, None] * away, 0)
-    return (rest + moved).astype(x.dtype)
+        own = np.where(held[:, None], moved + short[:, None] * away[: len(x)], 0)
+    return x + moved
 
 
 # --- pins and weights -----------------------------------------------------------------------------------------------
 
 
-def pins_of(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, float]:
+def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; and the area carried, m^2.
 
     The body carries the upper half of the cloth where it lies on skin that faces up. If less than `CARRIED` is carried, the
-    highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it.
+    highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it. distance (V,), away (V, 3): to
+    the body, m, and the unit vectors that lead away from it.
     """
     x, faces = garment.vertices.astype(np.float64), garment.faces
-    distance, away = _distances(x, body, surface)
     double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=1)
     area = np.bincount(faces.ravel(), np.repeat(double / 6, 3), len(x))
     outward = vertex_normals(x, faces)
@@ -160,7 +158,9 @@ def pins_of(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple
     return np.flatnonzero(near <= BAND).astype(np.int32), carried
 
 
-def spread_weights(garment: GarmentRecord, body: BodyRecord, surface: Surface) -> tuple[np.ndarray, float]:
+def spread_weights(
+    garment: GarmentRecord, body: BodyRecord, distance: np.ndarray, away: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return smooth skinning weights (V, J) that follow the body where cloth lies on it; and the share of vertices that do so.
 
         min_w  sum_v c_v (w_v - w_body(v))^2 + (L / l)^2 sum_(edges v-u) (w_v - w_u)^2,
@@ -175,7 +175,6 @@ def spread_weights(garment: GarmentRecord, body: BodyRecord, surface: Surface) -
 
     x, edges = garment.vertices, topology(garment.faces)[0]
     own = transfer_weights(x, body.vertices, body.faces, body.weights)
-    distance, away = _distances(x, body, surface)
     facing = np.maximum(np.sum(vertex_normals(x, garment.faces) * away, axis=1), 0)
     trust = np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing + LEAST
     graph = adjacency(edges, len(x))

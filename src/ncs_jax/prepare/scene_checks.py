@@ -13,9 +13,10 @@ import numpy as np
 
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import LINE, relative_heights, topology
-from ncs_jax.geometry.surface_distance import signed_distance
+from ncs_jax.geometry.mesh import LINE, relative_heights
+from ncs_jax.geometry.surface_distance import border_of, signed_distance
 from ncs_jax.io import MotionRecord
+from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.prepare.setting import RECURRENT, Setting
@@ -40,6 +41,7 @@ RANGES = {
 DEEP = 0.01  # m that vertices may be inside the body, where the body alone carries the garment,
 MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
+FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
 CLEAR = 0.02  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
@@ -110,9 +112,7 @@ def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return how deep in the body the garment is as the body alone carries it (poses, verts), m, or -`CLEAR` if clear of it."""
     model, body = a.model, required(a.body, "body")
     rest, skin = (np.asarray(x, np.float64) for x in (model.garment.mesh.rest, required(model.body, "model.body")))
-    edges, sides, _ = topology(faces)
-    border = np.zeros(faces.max() + 1, bool)
-    border[edges[sides[:, 1] < 0]] = True
+    border = border_of(faces, int(faces.max()) + 1)
     depths = []
     for pose, transforms in zip(poses, joint_transforms(body, poses)[:, list(model.source_joints)], strict=True):
         bare = corrected_rest(skin, model.correctives, transforms, model.skeleton.parents)
@@ -120,6 +120,24 @@ def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
         x = carried(rest, model.blend, transforms)
         depths.append(-signed_distance(x, np.concatenate(surface), faces, border, CLEAR))
     return np.stack(depths)
+
+
+def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
+    """Yield the risk of a collision that is too thin or too soft for the garment's edges: skin shows between its vertices."""
+    model, collision = a.model, a.scene.physics.collision
+    if collision.stiffness == 0:
+        return
+    rest, own = np.asarray(model.garment.mesh.rest, np.float64), np.asarray(model.garment.mesh.faces)
+    below = np.concatenate([required(model.body, "model.body"), *(layer.rest for layer in model.under)])
+    wanted = contact_for(rest, own, sinking(rest, own, below, faces))
+    pressed = least_thickness(0.0, vertex_share(rest, own), collision.stiffness)
+    if wanted.sinking < FLAT or collision.thickness >= wanted.sinking + pressed:
+        return
+    thick, edge, sunk, deeper = (f"{1000 * a:.3g} mm" for a in (collision.thickness, wanted.edge, wanted.sinking, pressed))
+    value = f"{thick}; triangles of {edge}, laid on the skin, sink {sunk} into its curves, and their load presses them {deeper}"
+    stiffness = max(wanted.stiffness, collision.stiffness)
+    mend = f"physics.collision: thickness = {wanted.thickness:g}, stiffness = {stiffness:g}, or a finer mesh"
+    yield Risk("thickness of the collision", value, "skin shows through the cloth", mend)
 
 
 def _worn_below(model: Model, pose: np.ndarray) -> list[np.ndarray]:
@@ -176,10 +194,12 @@ def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
-    found += [*_postures(a), *_material(a.scene), *_mesh(a)]
     faces = None
     if a.model.body is not None and a.body is not None:
         faces = touchable_faces(a.model, a.body, a.prepared.part)
+        found += _shows(a, faces)
+    found += [*_postures(a), *_material(a.scene), *_mesh(a)]
+    if faces is not None:
         found += _inside(a, faces, np.zeros((1, len(a.body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
     for name in a.motions:
         found += _motion(a, faces, name)
