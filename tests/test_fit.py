@@ -1,5 +1,6 @@
 """A garment brought onto a body: unit, axes and place, out of the skin, pins, weights."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
 from ncs_jax.geometry.mesh import topology
 from ncs_jax.io.mesh.axes import TURNS
+from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare.fit import BAND, fit
 from ncs_jax.prepare.garment_placement import place
@@ -223,3 +225,27 @@ def test_weights_of_another_body_are_refused(tmp_path):
     np.savez(tmp_path / "cloth.npz", blend_weights=np.full((len(cloth["vertices"]), 2), 0.3), **cloth)
     with pytest.raises(InputError, match=r"blend_weights, vertex 0: weights that sum to 1 expected"):
         assemble(load_scene(scene))
+
+
+def shirt_with_a_skirt():
+    """The packaged T-shirt with a wide skirt hung on its hem: two thirds of the cloth touch nothing."""
+    shirt = io.read_garment(ASSETS / "tshirt.npz")
+    x, loops = shirt.vertices.astype(np.float64), boundary_loops(shirt.faces)
+    hem = min(loops, key=lambda loop: x[loop, 1].mean())
+    middle, rows = x[hem].mean(axis=0), 20
+    rings = [hem, *(np.arange(len(hem)) + len(x) + r * len(hem) for r in range(rows))]
+    wide = [middle + (x[hem] - middle) * [1 + 0.15 * r, 0, 1 + 0.15 * r] - [0, 0.035 * r, 0] for r in range(1, rows + 1)]
+    strips = [np.stack(t, axis=1) for a, b in itertools.pairwise(rings)
+              for t in ((np.roll(a, -1), a, np.roll(b, -1)), (a, b, np.roll(b, -1)))]  # fmt: skip
+    faces = np.concatenate([shirt.faces, *strips]).astype(np.int32)
+    return io.GarmentRecord(np.concatenate([x, *wide]).astype(np.float32), faces)
+
+
+def test_a_loose_garment_that_shoulders_carry_is_accepted_with_a_warning():
+    """It is home to 1 cm; a loose skirt, which nothing carries, is refused above."""
+    body, given = io.read_body(ASSETS / "body.npz"), shirt_with_a_skirt()
+    x = (given.vertices + [0.2, -0.1, 0.15]) * 100
+    found = place("g.obj", replace(given, vertices=x.astype(np.float32)), body)
+    assert not found.doubt and found.scale == 0.01
+    assert np.linalg.norm(found.garment.vertices - given.vertices, axis=1).mean() < 0.01
+    assert "shoulders" in found.warning

@@ -103,6 +103,10 @@ def _say_where(placement) -> None:
         f"  lies      {100 * placement.lying:.0f} % on the skin, {100 * placement.inside:.0f} % inside the body; "
         f"the body passes through {100 * placement.threaded:.0f} % of its openings"
     )
+    if placement.warning:
+        print(f"  unsure    {placement.warning}. Look at the picture; --move if it is wrong")
+    if placement.turn and not placement.doubt:
+        print("  turned    if it is alike from front and back, --turn 0 leaves it as it is in the file")
     if placement.mirrored:
         print("  mirrored  left and right were exchanged: its faces looked inward, as left-handed axes make them. If only the")
         print("            faces are wrong, turn them around in the modeller first")

@@ -33,6 +33,8 @@ STAYS = 1.1, 0.5  # the misfit may be so many times that of the best place, and 
 RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on, one in another unit from this one on
 APART = 0.02  # of the height: what is nearer is no other place
 FLAT, AWAY = 1.06, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
+HELD = 0.2  # but not upward, where shoulders carry it and it loses so much of its contact there
+UPWARD, CARRIED = 0.6, 1 / 272  # skin this steep carries cloth, of the height squared: 0.01 m^2 under 1.65 m
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,7 @@ class Placement:
     turn about the vertical after it, degrees. mirrored: left and right were exchanged. shift (3,): how it was moved then, m.
     lying, inside: shares of its area on the skin, and inside the body. pierced: joints whose bones pass through the cloth.
     threaded: share of its openings, by length, that the body passes through. doubt: what speaks against it; empty: nothing.
+    warning: what is left uncertain in a place that is accepted.
     """
 
     garment: GarmentRecord
@@ -56,6 +59,7 @@ class Placement:
     pierced: tuple[str, ...]
     threaded: float
     doubt: str = ""
+    warning: str = ""
 
     @property
     def worn(self) -> bool:
@@ -279,14 +283,14 @@ def _choose(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> P
         ):
             return look
     kept = [(own, look) for own, look in ranked if not own.shift.any() and not own.turn and look.worn]
-    rival, loose = _rivals(ranked, cloth, skin), _uncertain(way, cloth, skin)
+    rival, (loose, warning) = _rivals(ranked, cloth, skin), _uncertain(way, cloth, skin)
     if not rival and loose and kept and not kept[0][1].doubt and _value(kept[0][0], cloth, skin) >= least:
         return kept[0][1]
     if rival or loose:
         return replace(kept[0][1] if kept else best, doubt=rival or loose)
     size = _size(way, cloth)
     tiny = f"it is {100 * size:.0f} cm large there, and in another unit it might be larger" if size < TINY * skin.height else ""
-    return replace(best, doubt="" if way.told else tiny)
+    return replace(best, doubt="" if way.told else tiny, warning=warning)
 
 
 def _size(way: _Way, cloth: Cloth) -> float:
@@ -320,12 +324,33 @@ def _rivals(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> s
     return ""
 
 
-def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> str:
-    """Name the direction in which the garment may as well be moved."""
+def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
+    """Name the direction in which the garment may as well be moved, and what is uncertain though that speaks not against it.
+
+    Cloth that hangs free has the same misfit everywhere and hides how much the rest loses. A garment that shoulders carry is
+    held from below: it may be lifted without much ado, but it falls back to where it lies on them.
+    """
     x, normals = way.points(cloth.points), cloth.normals @ way.turned
-    step = AWAY * skin.height
+    step, worst = AWAY * skin.height, SKIN * skin.height
+    contact, warning = 1 - way.cost / worst, ""
     for k, words in ((1, "up or down"), (0, "sideways"), (2, "back or forth")):
         for sign in (1, -1):
-            if _cost(x + sign * step * np.eye(3)[k], normals, skin) < FLAT * way.cost:
-                return f"it is so loose that it lies as well {100 * step:.0f} cm farther {words}"
-    return ""
+            cost = _cost(x + sign * step * np.eye(3)[k], normals, skin)
+            if cost >= FLAT * way.cost:
+                continue
+            lost = (cost - way.cost) / worst / contact if contact > 0 else 0.0
+            if (k, sign) != (1, 1) or lost < HELD or _carried(way, cloth, skin) < CARRIED * skin.height**2:
+                return f"it is so loose that it lies as well {100 * step:.0f} cm farther {words}", ""
+            warning = f"it is loose, and its height is told by the shoulders alone: {100 * step:.0f} cm higher it still has "
+            warning += f"{100 * (1 - lost):.0f} % of the contact"
+    return "", warning
+
+
+def _carried(way: _Way, cloth: Cloth, skin: Skin) -> float:
+    """Return the area, m^2, of the upper quarter of the garment that lies on skin that faces up."""
+    x, normals = way.points(cloth.points), cloth.normals @ way.turned
+    away, index = skin.tree.query(x)
+    there = skin.normals[index]
+    high = x[:, 1] > x[:, 1].max() - np.ptp(x[:, 1]) / 4
+    lies = (away < 2 * SKIN * skin.height) & (there[:, 1] > UPWARD) & (np.sum(normals * there, axis=1) > 0.5)
+    return float(np.mean(high & lies)) * cloth.area * way.scale**2

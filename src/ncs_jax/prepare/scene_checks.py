@@ -194,13 +194,13 @@ def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
-    faces = None
-    if a.model.body is not None and a.body is not None:
-        faces = touchable_faces(a.model, a.body, a.prepared.part)
+    body, faces = a.body, None
+    if a.model.body is not None and body is not None:
+        faces = touchable_faces(a.model, body, a.prepared.part)
         found += _shows(a, faces)
     found += [*_postures(a), *_material(a.scene), *_mesh(a)]
-    if faces is not None:
-        found += _inside(a, faces, np.zeros((1, len(a.body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
+    if faces is not None and body is not None:
+        found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
     for name in a.motions:
         found += _motion(a, faces, name)
     return found

@@ -1,0 +1,182 @@
+"""How often `ncs fit` brings a garment of another unit, axes and origin home: placed, refused, or wrong.
+
+    python -m benchmarks.placing [--seed 0] [--cases 40] [--shared ../shared/data] [--json FILE]
+
+Garments of three bodies: the packaged one; a wider, smaller one that was written as .glb and read again; SMPL's, where
+`--shared` has it. On each: shells of its own skin (a top, long sleeves, leggings, shorts), a skirt and a loose dress that hang
+around it, and what was made for it elsewhere (the packaged garments; SMPL's T-shirt and those of GAPS). A case takes one, in
+a random unit, with a random axis up, up to 30 cm off its place along each axis. It is placed where it comes within 2 cm (mean
+over its vertices) of
+where it was made, in its unit; wrong where it is accepted elsewhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax import InputError, io
+from ncs_jax.geometry.surface_distance import border_of, signed_distance
+from ncs_jax.io.mesh.axes import TURNS
+from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.packaged import ASSETS
+from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.garment_placement import place
+from ncs_jax.prepare.joint_names import anatomy
+from ncs_jax.prepare.retarget import body_names
+
+__all__ = ["garments_of", "main", "tried"]
+
+UNITS = (1.0, 0.1, 0.01, 0.001, 0.0254, 0.3048)
+OFFSET, RIGHT = 0.3, 0.02  # m
+LIMBS = {"top": (0.4, 0.0), "long_sleeves": (1.0, 0.0), "leggings": (0.0, 0.95), "shorts": (0.0, 0.4)}  # arms, legs covered
+
+
+def _roles(body: BodyRecord) -> dict[str, np.ndarray]:
+    """Return where shoulder, wrist, hip and ankle of the left side are, m."""
+    names = body_names(body)
+    roles = anatomy(names, body.parents.tolist()).roles
+    at = {role: body.joints[joint] for role, joint in roles.items()}
+    return {"shoulder": at["left arm"], "wrist": at["left hand"], "hip": at["left thigh"], "ankle": at["left foot"]}
+
+
+def garments_of(body: BodyRecord) -> Iterator[tuple[str, GarmentRecord]]:
+    """Yield garments that are made on a body: shells of its skin, 1 cm above it, and what hangs around its trunk."""
+    x, at = body.vertices.astype(np.float64), _roles(body)
+    shoulder, hip, waist = at["shoulder"], at["hip"], at["hip"][1] + 0.09
+    lifted = x + 0.01 * vertex_normals(x, body.faces)
+    along = (at["wrist"] - shoulder) / np.sum((at["wrist"] - shoulder) ** 2)
+    own = _follows_arms(body)
+    arm = own * np.maximum((x * np.where(x[:, :1] * shoulder[0] < 0, [[-1, 1, 1]], 1) - shoulder) @ along, 0)
+    leg = np.maximum(hip[1] - x[:, 1], 0) / (hip[1] - at["ankle"][1])
+    upper = (x[:, 1] > waist - 0.1) | (arm > 0.2)
+    below_neck = (x[:, 1] < shoulder[1] + 0.05) | (np.abs(x[:, 0]) > 0.08)
+    for name, (arms, legs) in LIMBS.items():
+        kept = upper & (arm < arms) & below_neck if arms else (leg < legs) & (x[:, 1] < waist) & (arm < 0.1)
+        yield name, _part(lifted, body.faces, kept)
+    for name, top, bottom in (("skirt", waist, 0.6 * hip[1]), ("dress", shoulder[1] - 0.12, 0.5 * hip[1])):
+        yield name, _hanging(x[arm < 0.05], top, bottom)
+
+
+def _follows_arms(body: BodyRecord) -> np.ndarray:
+    """Return which vertices (V,) follow an arm, by the largest of their weights."""
+    roles = anatomy(body_names(body), body.parents.tolist()).roles
+    arms = {roles["left arm"], roles["right arm"]}
+    for j, parent in enumerate(body.parents.tolist()):  # parents come first
+        arms |= {j} if parent in arms else set()
+    return np.isin(body.weights.argmax(axis=1), list(arms))
+
+
+def _part(x: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> GarmentRecord:
+    """Return the largest connected part of a surface all of whose corners are kept."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    inner = faces[kept[faces].all(axis=1)]
+    pairs = np.concatenate([inner[:, [0, 1]], inner[:, [1, 2]]])
+    label = connected_components(coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(x), len(x))), directed=False)[1]
+    inner = inner[label[inner[:, 0]] == np.bincount(label[inner[:, 0]]).argmax()]
+    used, renumbered = np.unique(inner, return_inverse=True)
+    return GarmentRecord(x[used].astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32))
+
+
+def _hanging(x: np.ndarray, top: float, bottom: float, around: int = 48, rows: int = 20) -> GarmentRecord:
+    """Return a tube around a trunk (V, 3) that never becomes narrower downward, and flares by a tenth of its height."""
+    centre = np.median(x[np.abs(x[:, 1] - top) < 0.05], axis=0)
+    angle, heights = 2 * np.pi * np.arange(around) / around, np.linspace(top, bottom, rows)
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rings, wide = [], np.zeros(around)
+    for y in heights:
+        slab = x[np.abs(x[:, 1] - y) < 0.03][:, [0, 2]] - centre[[0, 2]]
+        support = (slab @ ray.T).max(axis=0)  # the hull's support, so that it is convex
+        wide = np.maximum(wide + 0.1 * (top - bottom) / rows, support + 0.012)
+        ring = (wide[:, None] * ray + centre[[0, 2]])[:, [0, 0, 1]]
+        ring[:, 1] = y
+        rings.append(ring)
+    k, after = np.arange(around), (np.arange(around) + 1) % around
+    faces = [np.stack(t, axis=1) for r in range(rows - 1) for t in _quads(r * around, around, k, after)]
+    return GarmentRecord(np.concatenate(rings).astype(np.float32), np.concatenate(faces).astype(np.int32))
+
+
+def _quads(first: int, around: int, k: np.ndarray, after: np.ndarray):
+    low = first + around
+    return (first + k, first + after, low + k), (first + after, low + after, low + k)
+
+
+def _cast(shared: Path) -> Iterator[tuple[str, BodyRecord, GarmentRecord]]:
+    """Yield name, body and garment, at its place, of all that there is."""
+    packaged = io.read_body(ASSETS / "body.npz")
+    other = replace(packaged, vertices=packaged.vertices * [1.1, 0.9, 1.1], joints=packaged.joints * [1.1, 0.9, 1.1])
+    with tempfile.TemporaryDirectory() as folder:
+        io.write_body(f"{folder}/body.glb", other)
+        bodies = {"packaged": packaged, "glb": io.read_body(f"{folder}/body.glb")}
+    if (shared / "smpl_research_only" / "body.npz").exists():
+        bodies["smpl"] = io.read_body(shared / "smpl_research_only" / "body.npz")
+    for label, body in bodies.items():
+        for name, garment in garments_of(body):
+            yield f"{label} {name}", body, garment
+    for name in ("tshirt", "skirt"):
+        yield f"packaged ncs:{name}", packaged, io.read_garment(ASSETS / f"{name}.npz")
+    if "smpl" in bodies:
+        body = bodies["smpl"]
+        for file in (shared / "smpl_research_only" / "tshirt.obj", *sorted((shared / "gaps_research_only").glob("*.obj"))):
+            yield f"smpl {file.stem}", body, _at_home(io.read_garment(file), body)
+
+
+def _at_home(garment: GarmentRecord, body: BodyRecord) -> GarmentRecord:
+    """Return a garment of SMPL where it lies best: as it is, or as much higher and farther back as the model's pelvis is."""
+    rim, some = border_of(body.faces, len(body.vertices)), garment.vertices[::7]
+    shifts = [np.zeros(3), *(np.array([0, y, z]) for y in np.arange(0.20, 0.25, 0.01) for z in (-0.03, -0.02, -0.01, 0.0))]
+    near = [signed_distance(some + s, body.vertices, body.faces, rim) for s in shifts]
+    best = shifts[int(np.argmin([np.abs(d).mean() + 10 * np.maximum(-d, 0).mean() for d in near]))]
+    return replace(garment, vertices=(garment.vertices + best).astype(np.float32))
+
+
+def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator) -> dict:
+    """Return how one garment is placed from a random unit, axis and offset: what came out, its error, m, and why not."""
+    unit, up = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)]
+    x = (garment.vertices + rng.uniform(-OFFSET, OFFSET, 3)) @ TURNS[up].T / unit
+    try:
+        found = place("garment", replace(garment, vertices=x.astype(np.float32), weights=None), body)
+    except InputError as error:
+        return {"outcome": "refused", "error": None, "why": str(error), "unit": unit, "up": up}
+    away = float(np.linalg.norm(found.garment.vertices - garment.vertices, axis=1).mean())
+    outcome = "refused" if found.doubt else "placed" if away <= RIGHT and np.isclose(found.scale, unit) else "wrong"
+    return {"outcome": outcome, "error": away, "why": found.doubt, "unit": unit, "up": up}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Try cases, print each and how many were placed, refused and wrong; exit code 1 where one is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--shared", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    rng, cast, rows = np.random.default_rng(options.seed), list(_cast(options.shared)), []
+    order = np.concatenate([rng.permutation(len(cast)) for _ in range(-(-options.cases // len(cast)))])
+    for case in order[: options.cases]:
+        name, body, garment = cast[case]
+        row = {"garment": name, **tried(garment, body, rng)}
+        rows.append(row)
+        error = "" if row["error"] is None else f"{1000 * row['error']:.0f} mm"
+        print(f"{name:28} {row['unit']:7g} {row['up']}  {row['outcome']:8} {error:>8}  {row['why']}", flush=True)
+    counts = {what: sum(row["outcome"] == what for row in rows) for what in ("placed", "refused", "wrong")}
+    worst = max((row["error"] for row in rows if row["outcome"] == "placed"), default=0.0)
+    print(
+        ", ".join(f"{what} {count}" for what, count in counts.items()) + f"; largest error of the placed {1000 * worst:.1f} mm"
+    )
+    if options.json:
+        options.json.write_text(json.dumps({"seed": options.seed, **counts, "largest": worst, "cases": rows}, indent=1))
+    return int(counts["wrong"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
