@@ -248,4 +248,4 @@ def test_a_loose_garment_that_shoulders_carry_is_accepted_with_a_warning():
     found = place("g.obj", replace(given, vertices=x.astype(np.float32)), body)
     assert not found.doubt and found.scale == 0.01
     assert np.linalg.norm(found.garment.vertices - given.vertices, axis=1).mean() < 0.01
-    assert "shoulders" in found.warning
+    assert "what carries it tells its height" in found.warning

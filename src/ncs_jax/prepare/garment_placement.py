@@ -32,9 +32,8 @@ ON_BODY = 0.05  # least share of a garment that lies on the body
 STAYS = 1.1, 0.5  # the misfit may be so many times that of the best place, and so much of the contact must be there
 RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on, one in another unit from this one on
 APART = 0.02  # of the height: what is nearer is no other place
-FLAT, AWAY = 1.06, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
-HELD = 0.2  # but not upward, where shoulders carry it and it loses so much of its contact there
-UPWARD, CARRIED = 0.6, 1 / 272  # skin this steep carries cloth, of the height squared: 0.01 m^2 under 1.65 m
+FLAT, AWAY = 1.08, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
+HELD = 0.15, 1.0  # but not upward, where it loses so much of its contact, and so much as far down: something carries it
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,32 +324,25 @@ def _rivals(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> s
 
 
 def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
-    """Name the direction in which the garment may as well be moved, and what is uncertain though that speaks not against it.
+    """Name the direction in which the garment may as well be moved; else what is uncertain though it does not speak against it.
 
-    Cloth that hangs free has the same misfit everywhere and hides how much the rest loses. A garment that shoulders carry is
-    held from below: it may be lifted without much ado, but it falls back to where it lies on them.
+    Cloth that hangs free has the same misfit everywhere and hides how much the rest loses. A garment that shoulders or hips
+    carry is held from below: it may be lifted without much ado, but it falls back to where it lies on them.
     """
     x, normals = way.points(cloth.points), cloth.normals @ way.turned
-    step, worst = AWAY * skin.height, SKIN * skin.height
-    contact, warning = 1 - way.cost / worst, ""
+    step, worst, warning = AWAY * skin.height, SKIN * skin.height, ""
+
+    def lost(shift: np.ndarray) -> tuple[float, float]:
+        cost = _cost(x + step * shift, normals, skin)
+        return cost / way.cost, (cost - way.cost) / max(worst - way.cost, 1e-9 * worst)
+
     for k, words in ((1, "up or down"), (0, "sideways"), (2, "back or forth")):
         for sign in (1, -1):
-            cost = _cost(x + sign * step * np.eye(3)[k], normals, skin)
-            if cost >= FLAT * way.cost:
+            ratio, less = lost(sign * np.eye(3)[k])
+            if ratio >= FLAT:
                 continue
-            lost = (cost - way.cost) / worst / contact if contact > 0 else 0.0
-            if (k, sign) != (1, 1) or lost < HELD or _carried(way, cloth, skin) < CARRIED * skin.height**2:
+            if (k, sign) != (1, 1) or less < HELD[0] or lost(-np.eye(3)[1])[1] < HELD[1]:
                 return f"it is so loose that it lies as well {100 * step:.0f} cm farther {words}", ""
-            warning = f"it is loose, and its height is told by the shoulders alone: {100 * step:.0f} cm higher it still has "
-            warning += f"{100 * (1 - lost):.0f} % of the contact"
+            warning = f"it is loose, and only what carries it tells its height: {100 * step:.0f} cm higher it still has "
+            warning += f"{100 * (1 - less):.0f} % of the contact"
     return "", warning
-
-
-def _carried(way: _Way, cloth: Cloth, skin: Skin) -> float:
-    """Return the area, m^2, of the upper quarter of the garment that lies on skin that faces up."""
-    x, normals = way.points(cloth.points), cloth.normals @ way.turned
-    away, index = skin.tree.query(x)
-    there = skin.normals[index]
-    high = x[:, 1] > x[:, 1].max() - np.ptp(x[:, 1]) / 4
-    lies = (away < 2 * SKIN * skin.height) & (there[:, 1] > UPWARD) & (np.sum(normals * there, axis=1) > 0.5)
-    return float(np.mean(high & lies)) * cloth.area * way.scale**2
