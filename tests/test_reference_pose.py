@@ -16,8 +16,10 @@ from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.scene.spec import MotionSpec
 from tests.test_retarget import figure, forward
+from tools.check_inputs import main as check_inputs
 
 FRAMES = 48
+TIPPED = Rotation.from_rotvec([0.6, 0, 0]).as_matrix()
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +141,23 @@ def test_a_person_at_rest_stays_as_it_is(body, droop):
     auto, zero = (retarget_to_body(motion, body, MotionSpec(rest=rest)) for rest in ("auto", "zero"))
     np.testing.assert_array_equal(auto.poses, zero.poses)
     assert auto.notes == zero.notes
+
+
+@pytest.mark.parametrize("frame", [4, 18])
+def test_a_zero_pose_that_is_a_moment_of_the_motion_is_not_taken_for_standing(body, frame):
+    """A step, its arms and legs apart and a foot tipped, is the zero pose: trunk and feet still stand as they do on average."""
+    motion = walk()
+    joints, parents, keys = np.asarray(motion.joints), np.asarray(motion.parents), figure("mixamo")[3]
+    turns = forward(joints, parents, motion)[0][frame]
+    tipped = [j for j, (side, part) in enumerate(keys) if side == "left" and part in ("foot", "toe")]
+    turns[tipped] = Rotation.from_rotvec([0.8, 0, 0]).as_matrix() @ turns[tipped]
+    other = told_since(motion, turns)
+    right, taken, zero = driven(motion, body), driven(other, body), driven(other, body, rest="zero")
+    of = [j for j, n in enumerate(body.joint_names) if any(w in n for w in ("Hips", "Spine", "Shoulder", "Foot"))]
+    assert apart(right, taken)[0][of].max() < 2 < 20 < apart(right, zero)[0][of].max()
+    assert "a moment of a movement" in " ".join(taken[2].notes) and "degrees; motion.rest" in " ".join(taken[2].notes)
+    short = replace(other, poses=other.poses[:2], translation=other.translation[:2])  # too few frames to know better
+    assert not any("reference pose" in note for note in retarget_to_body(short, body, MotionSpec()).notes)
 
 
 def test_what_has_no_reference_pose_is_refused(rng, body):
@@ -271,3 +290,19 @@ def test_hips_and_spine_beside_each_other(body):
     other = replace(motion, joint_names=("Base_Root", *names), parents=above, joints=joints, poses=poses)
     angle, far = apart(driven(motion, body), driven(other, body))
     assert angle.max() < 1e-3 and far < 1e-5
+
+
+def test_the_tool_that_tries_folders_tells_what_is_off(tmp_path, body, capsys):
+    """It passes a motion under another convention, and not one whose feet are turned in the zero pose alone."""
+    motion = walk(size=100.0)
+    motion = replace(motion, translation=motion.translation * 100)
+    path = {motion.joint_names[0]: np.asarray(motion.joints)[0] + motion.translation}
+    (tmp_path / "twin.bvh").write_text(bvh_text(motion, path))
+    (tmp_path / "x.bvh").write_text(bvh_text(told_since(motion, along(motion, 1)), path))
+    assert check_inputs([str(tmp_path)]) == 0
+    feet = np.broadcast_to(np.eye(3), (len(motion.parents), 3, 3)).copy()
+    feet[[j for j, (_, part) in enumerate(figure("mixamo")[3]) if part in ("foot", "toe")]] = TIPPED
+    (tmp_path / "x.bvh").write_text(bvh_text(told_since(motion, feet), path))
+    capsys.readouterr()
+    assert check_inputs([str(tmp_path)]) == 1
+    assert "limbs to 0.00 degrees" in (told := capsys.readouterr().out) and "not all pass" in told

@@ -17,7 +17,7 @@ from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
-from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_person, since
+from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.spec import MotionSpec, Scene
@@ -104,7 +104,8 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
         raise InputError('"auto", "zero" or the number of a frame expected', field="motion.rest", value=spec.rest)
     motion = motion if spec.up == "auto" else replace(motion, up=spec.up)
     of = paired(motion, body, spec.joints)[0]
-    if spec.rest == "zero" or (spec.rest == "auto" and is_person(rest_of(motion)[0], of)):
+    person = is_person(rest_of(motion)[0], of)
+    if spec.rest == "zero" or (spec.rest == "auto" and person and is_even(rest_of(motion)[0], of)):
         return motion
     up = motion.up or standing_axis(motion, of)
     if spec.rest == "auto":
@@ -113,7 +114,14 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
             first = read(0, min(start, LOOK)) if start > 0 else _frames(motion, 0, LOOK) if spec.frames else read(0, LOOK)
         except InputError:  # frames that the scene leaves out may be broken
             first = _frames(motion, 0, LOOK)
-        found = find_reference(motion, of, up, first)
+        why = "a moment of a movement, with left and right unlike" if person else "no person"
+        try:
+            found = find_reference(motion, of, up, first)
+            found = replace(found, note=f"{found.note}; the zero pose is {why}")
+        except InputError:
+            if person:
+                return motion
+            raise
     else:
         number = int(spec.rest)
         said = f"the reference pose is frame {number}, as motion.rest says"

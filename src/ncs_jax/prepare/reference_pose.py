@@ -27,12 +27,13 @@ from ncs_jax.io.character.rig import quarter_turns
 from ncs_jax.prepare.joint_names import Limbs
 from ncs_jax.prepare.skeleton import LIMBS, forward, joint_turns, least_turn, rest_of, sampled, side_vector, top
 
-__all__ = ["Reference", "find_reference", "from_frame", "is_person", "since"]
+__all__ = ["Reference", "find_reference", "from_frame", "is_even", "is_person", "since"]
 
 UPRIGHT = 35.0  # degrees by which hips to head may lean in a frame that tells about standing
 FEWEST = 3  # such frames
 POSTURE = 8.0  # degrees by which people who stand and walk lean and bend a joint of the trunk, on average
 NEAR = 15.0  # degrees within which a joint's axes are a standing person's, where they tell
+EVEN = 15.0  # degrees by which limbs of a skeleton at rest may differ from their images in the mirror
 STRAIGHT = 15.0  # degrees by which a leg that is straight is bent
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
 
@@ -121,6 +122,16 @@ def is_person(places: np.ndarray, of: Limbs) -> bool:
     return True
 
 
+def is_even(places: np.ndarray, of: Limbs) -> bool:
+    """Tell whether joints (J, 3) are where a person's are who stands as skeletons rest: straight, or both sides alike.
+
+    Recorders without such a pose write the first frame of the motion as the zero pose: a moment of a step or a dance, in
+    which trunk and feet are as they happen to be.
+    """
+    own = places @ _person_axes(places, of, "y")
+    return _asymmetry(own, of) < EVEN or _bend(own, of) < EVEN
+
+
 def _trunk(of: Limbs) -> list[int]:
     """Return the joints from the hips to the head."""
     return [of.roles["hips"], *of.spine, *of.neck, *([of.roles["head"]] if "head" in of.roles else [])]
@@ -173,9 +184,7 @@ def _among(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
             best = off, frame, kind
     if best is None:
         return None
-    return from_frame(
-        first, of, up, best[1], f"the reference pose is frame {best[1]}, a {best[2]}, as the zero pose is no person"
-    )
+    return from_frame(first, of, up, best[1], f"the reference pose is frame {best[1]}, a {best[2]}")
 
 
 def _spread(own: np.ndarray, of: Limbs) -> float:
@@ -213,14 +222,15 @@ def _asymmetry(own: np.ndarray, of: Limbs) -> float:
 def _built(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
     """Build a reference pose from the frames in which a person is upright; None where there are fewer than `FEWEST`.
 
-    - Trunk and head stand as they do on average, as seen by someone who turns with hips and shoulders; the hips'
-      left is along the line of the hip joints, the chest's along that of the collar bones. Where that is within
-      `NEAR` degrees of the joint's own axes, and these tell more than the bone's direction, they stand as the axes do. Where
-      all bones from hips to neck are within `POSTURE` degrees of the vertical on average, they are vertical.
+    - Trunk and head stand as they do on average in the third of the frames that is straightest, as seen by someone who turns
+      with hips and shoulders; the hips' left is along the line of the hip joints, the chest's along that of the collar bones.
+      Where that is within `NEAR` degrees of the joint's own axes, and these tell more than the bone's direction, they stand as
+      the axes do, unless the zero pose is a moment of a movement. Where all bones from hips to neck are within `POSTURE`
+      degrees of the vertical on average, they are vertical.
     - A thigh points down, an arm to its side, a forearm along the arm. The shin is to the thigh as in the frame that bends the
       knee least, if it is straight there.
     - The twist about a bone lets elbows bend forward and knees backward, where they bend; else it is least on average.
-    - A foot stands as it does on average while it rests on the ground, or is to the shin as always where the ankle is stiff.
+    - A foot stands as it does on average while it is flat on the ground, or is to the shin as always where the ankle is stiff.
     - Every other joint is to its parent as on average.
     """
     turns, places = forward(sampled(motion))
@@ -229,19 +239,30 @@ def _built(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
     if upright.sum() < FEWEST:
         return None
     axes = _person_axes(places, of, up)
-    build = _Builder(turns[upright], places[upright], axes[upright], of)
-    note = "the reference pose is built from the bones' directions in the frames, as the zero pose is no person"
+    moment = is_person(rest_of(motion)[0], of)
+    build = _Builder(
+        turns[upright], places[upright], axes[upright], of, near=0 if moment else NEAR, alike=0 if moment else POSTURE
+    )
+    note = (
+        "the reference pose is built from the bones' directions in the frames: trunk, head, collars and feet to about "
+        f"{build.spread():.0f} degrees; motion.rest names a better one, as a frame in T-pose"
+    )
     return Reference(build.pose(rest_of(motion)[1]), note)
 
 
 @dataclass(frozen=True, eq=False)
 class _Builder:
-    """Frames of an upright person: world rotations (T, J, 3, 3), places (T, J, 3), the person's axes (T, 3, 3), limbs."""
+    """Frames of an upright person: world rotations (T, J, 3, 3), places (T, J, 3), the person's axes (T, 3, 3), limbs.
+
+    near, alike: degrees within which a joint's axes are taken for a standing person's, where they tell, and where they do not.
+    """
 
     turns: np.ndarray
     places: np.ndarray
     axes: np.ndarray
     of: Limbs
+    near: float
+    alike: float
 
     def pose(self, parents: np.ndarray) -> np.ndarray:
         """Return C (J, 3, 3), parents before children."""
@@ -254,7 +275,7 @@ class _Builder:
                 above = trunk[trunk.index(j) + 1 :]
                 out[j] = self._upright(j, above[0] if above else None).T
             elif parent < 0 or (part == "foot" and not self._stiff(j, parent)):
-                out[j] = (self._standing(j) if part == "foot" else self._mean(j, self.axes)).T
+                out[j] = (self._standing(j) if part == "foot" else self._mean(j, self.axes, self.straightest)).T
             else:
                 out[j] = out[parent] @ self._mean(parent, self.turns[:, j])
                 if part in LIMBS and (end := self.of.roles.get(f"{side} {LIMBS[part]}")) is not None:
@@ -265,8 +286,25 @@ class _Builder:
     def straight(self) -> bool:
         """Whether all bones from the hips to the neck may be vertical in a person who stands: they are nearly so on average."""
         chain = [self.of.roles["hips"], *self.of.spine, *self.of.neck[:1]]
-        seen = [(self._mean(a, self.axes)[:, 1], self._direction(a, b)) for a, b in pairwise(chain)]
+        seen = [(self._mean(a, self.axes, self.straightest)[:, 1], self._direction(a, b)) for a, b in pairwise(chain)]
         return all(_angle(up, bone) < POSTURE for up, bone in seen)
+
+    @cached_property
+    def straightest(self) -> np.ndarray:
+        """The third of the frames (T,) in which hips to head lean least and knees bend least, the latter for a quarter."""
+        lean = _angle(self.places[:, top(self.of)] - self.places[:, self.of.roles["hips"]], self.axes[:, :, 1])
+        for side in ("left", "right"):
+            leg = [self.of.roles.get(f"{side} {part}") for part in ("thigh", "shin", "foot")]
+            if None not in leg:
+                hip, knee, ankle = (self.places[:, j] for j in leg)
+                lean = lean + _angle(knee - hip, ankle - knee) / 8
+        return lean <= np.percentile(lean, 33)
+
+    def spread(self) -> float:
+        """Return by how many degrees (r.m.s.) hips, spine and head turn about their means: so uncertain is what is straight."""
+        means = {j: self._mean(j, self.axes, self.straightest) for j in _trunk(self.of)}
+        off = [[_turn(mean, seen) for seen in np.swapaxes(self.turns[:, j], 1, 2) @ self.axes] for j, mean in means.items()]
+        return float(np.sqrt(np.square(off).mean(axis=1).max()))
 
     def _mean(self, j: int, of: np.ndarray, frames=slice(None)) -> np.ndarray:
         """Return the mean rotation (3, 3) of frames (T, 3, 3) as seen from joint j."""
@@ -280,20 +318,20 @@ class _Builder:
 
     def _upright(self, j: int, above: int | None) -> np.ndarray:
         """Return columns that point left, up and ahead as seen from a joint of the trunk, see `_built`."""
-        mean = self._mean(j, self.axes)
+        mean = self._mean(j, self.axes, self.straightest)
         left = self._left(j)
         if left is not None and _angle(left, mean[:, 0]) < NEAR:
             mean = least_turn(mean[:, 0], left) @ mean
         own = max(quarter_turns(), key=lambda q: np.trace(q.T @ mean))
         bone = None if above is None else self._direction(j, above)
         if bone is None or not bone.any():
-            return own if _turn(own, mean) < NEAR else mean
+            return own if _turn(own, mean) < self.near else mean
         tells = 0.5 < _angle(bone, own[:, 1]) < 45 and abs(bone @ own[:, 0]) < 0.01
-        if tells and _turn(own, mean) < NEAR:
+        if tells and _turn(own, mean) < self.near:
             return own
         if self.straight:
             mean = least_turn(mean[:, 1], bone) @ mean
-            return own if _turn(own, mean) < POSTURE and _angle(bone, own[:, 1]) < 0.5 else mean
+            return own if _turn(own, mean) < self.alike and _angle(bone, own[:, 1]) < 0.5 else mean
         return mean
 
     def _left(self, j: int) -> np.ndarray | None:
@@ -312,9 +350,15 @@ class _Builder:
         return bool(np.max([_turn(s, self._mean(parent, self.turns[:, j])) for s in seen]) < 2)
 
     def _standing(self, j: int) -> np.ndarray:
-        """Return columns that point left, up and ahead as seen from a foot that rests on the ground: the slowest third."""
-        speed = np.linalg.norm(np.gradient(self.places[:, j], axis=0), axis=1) if len(self.places) > 1 else np.zeros(1)
-        return self._mean(j, self.axes, speed <= np.percentile(speed, 33))
+        """Return columns that point left, up and ahead as seen from a foot flat on the ground: low, and of those frames slow.
+
+        A foot that tips over its toes or hangs in the air has its ankle higher.
+        """
+        place = self.places[:, j]
+        height = np.einsum("ta,ta->t", place, self.axes[:, :, 1])
+        speed = np.linalg.norm(np.gradient(place, axis=0), axis=1) if len(place) > 1 else np.zeros(1)
+        low = height <= np.percentile(height, 33)
+        return self._mean(j, self.axes, low & (speed <= np.percentile(speed[low], 50)))
 
     def _limb(self, j: int, parent: int, out: np.ndarray, side: str, part: str, end: int) -> np.ndarray:
         """Return C (3, 3) of a joint of arm or leg, see `_built`."""
