@@ -214,6 +214,19 @@ def test_postures_that_nobody_holds_are_told(rng, body):
     assert "arms inside the trunk" in [f[0] for f in posture_faults(replace(right, poses=crossed), body, "y")]
 
 
+@pytest.mark.parametrize("degrees", [30, 60, 90])
+def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degrees):
+    motion = walk()
+    for parts, axis, words in ((("clavicle",), 2, "collar bone turns"), (("foot", "toe"), 0, "feet are tipped")):
+        turns = np.broadcast_to(np.eye(3), (len(motion.parents), 3, 3)).copy()
+        for j, (side, part) in enumerate(figure("mixamo")[3]):
+            if part in parts:
+                sign = -1 if axis == 2 and side == "right" else 1
+                turns[j] = Rotation.from_rotvec(sign * np.radians(degrees) * np.eye(3)[axis]).as_matrix()
+        told = list(posture_faults(driven(told_since(motion, turns), body)[2], body, "y"))
+        assert told and all(words in fault[0] and "motion.rest" in fault[3] for fault in told)
+
+
 def bvh_text(motion: MotionRecord, positions: dict[str, np.ndarray], hips: np.ndarray | None = None) -> str:
     """A .bvh in which some joints have position channels (T, 3); with `hips` a still or moving root (T, 3) stands above."""
     joints, parents, names = np.asarray(motion.joints), np.asarray(motion.parents), motion.joint_names

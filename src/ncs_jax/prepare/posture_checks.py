@@ -25,8 +25,9 @@ AIR = 0.12, 1.0, 0.7  # m above the lowest sole and s, higher and longer than ju
 INSIDE = 0.25  # share of the frames in which an elbow or a wrist is in the trunk (0.03)
 TRUNK = 0.6, 0.35  # half the width and half the depth of the trunk, of half the distance between the shoulders
 # Degrees by which a joint has turned since rest, as seen from another, that nobody holds: chest (54), head (34), collar (19).
-SPINE, COLLAR = 75.0, 50.0
+SPINE, COLLAR = 75.0, 27.0
 SIDES = "left", "right"
+TIPPED = 20.0  # degrees by which both feet are tipped in frames in which they are low and slow (7; a dancer's one foot, 56)
 KNEE = 30.0  # degrees by which a shin points ahead of its thigh (0)
 
 
@@ -72,6 +73,7 @@ def posture_faults(record: MotionRecord, body: BodyRecord, world: str) -> Iterat
     yield from _floats(figure)
     yield from _arms_inside(figure)
     yield from _bends(figure)
+    yield from _tipped(figure)
 
 
 def _lies(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
@@ -135,3 +137,19 @@ def _bends(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
         if (angle := float(np.percentile(ahead, 100 - MOST))) > KNEE:
             value = f"by more than {angle:.0f} degrees, in {MOST:.0f} % of the frames"
             yield f"the {side} knee bends forward", value, "the zero pose was not understood", "motion.rest, or motion.joints"
+
+
+def _tipped(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
+    """Yield a fault where both feet, when they should be flat on the ground, are not as at rest."""
+    feet, least = [f.of.roles.get(f"{side} foot") for side in SIDES], 180.0
+    if None in feet or len(f.places) < 2:
+        return
+    for foot in feet:
+        height, speed = f.places[:, foot] @ f.up, np.linalg.norm(np.gradient(f.places[:, foot], axis=0), axis=1)
+        low = height <= np.percentile(height, 33)
+        upward = f.turns[low & (speed <= np.percentile(speed[low], 50)), foot] @ f.axes[:, 1]
+        tilt = np.degrees(np.arctan2(np.linalg.norm(np.cross(upward, f.up), axis=1), upward @ f.up))
+        least = min(least, float(np.percentile(tilt, 100 - MOST)))
+    if least > TIPPED:
+        value = f"by more than {least:.0f} degrees, where they are low and slow"
+        yield "both feet are tipped", value, "the zero pose was not understood", "motion.rest, or motion.joints"
