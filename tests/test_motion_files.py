@@ -156,6 +156,11 @@ def test_what_a_bvh_cannot_mean_is_refused_by_name(tmp_path, case):
         ("Hüfte", "latin-1"),
         ("hanché", "latin-1"),
         ("Bip01 左足", "utf-8"),
+        ("左大腿", "gb18030"),
+        ("髋部", "gb18030"),
+        ("왼쪽 어깨", "euc-kr"),
+        ("척추", "euc-kr"),
+        ("créé à Noël", "latin-1"),
     ],
 )
 def test_names_in_the_encodings_of_their_tools(tmp_path, name, encoding):

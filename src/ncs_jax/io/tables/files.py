@@ -17,6 +17,13 @@ __all__ = ["LARGEST", "decoded", "readable", "reading", "replacing", "text_of", 
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
 PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
 
+# Characters of words for parts of a body, by the encodings in which editors on Windows save them.
+PARTS = {
+    "cp932": "左右上下半身首腰肩腕肘手足膝頭胸指骨盤脚ひじざつまセンターグルブ",
+    "gb18030": "左右上下身首腰肩腕肘手足膝头胸指骨盆脚腿臂颈髋脊柱踝趾根",
+    "euc-kr": "왼쪽오른손목팔다리발무릎어깨엉덩머척추허가슴골반상하체루트",
+}
+
 
 def readable(path: str | Path) -> Path:
     """Return the path of a file. Raise an InputError unless it is a regular file, not empty, that may be read."""
@@ -61,9 +68,10 @@ def text_of(path: str | Path) -> tuple[Path, str]:
 
 
 def decoded(data: bytes) -> str:
-    """Return the text that bytes are: UTF-8, UTF-16 with or without its mark, else Shift-JIS or Western European.
+    """Return the text that bytes are: UTF-8, UTF-16 with or without its mark, else Shift-JIS, GB18030, EUC-KR or Latin-1.
 
-    Bytes from 0x80 to 0x9f tell the last two apart: they begin most Japanese characters, and are no letters of Western Europe.
+    Of the encodings of `PARTS` it is the one in which most characters are of words for parts of a body. Where none is, bytes
+    from 0x80 to 0x9f tell Japanese from Western European: they begin most Japanese characters, and are no letters there.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", errors="replace")
@@ -71,6 +79,13 @@ def decoded(data: bytes) -> str:
         return data.decode("utf-16-be" if data[:1] == b"\0" else "utf-16-le", errors="replace")
     with suppress(UnicodeDecodeError):
         return data.decode("utf-8-sig")
+    found = {}
+    for encoding, parts in PARTS.items():
+        with suppress(UnicodeDecodeError):
+            text = data.decode(encoding)
+            found[text] = sum(text.count(part) for part in parts)
+    if max(found.values(), default=0):
+        return max(found, key=lambda text: found[text])
     with suppress(UnicodeDecodeError):
         return data.decode("cp932" if re.search(rb"[\x80-\x9f]", data) else "latin-1")
     return data.decode("latin-1")
