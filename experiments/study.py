@@ -30,6 +30,7 @@ from ncs_jax.metrics.motion import compare_motion, measure_motion
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.methods.method import Method
 from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.spec import split_frames
 from ncs_jax.training.batches import batches, chunks
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.step import chunk_runner, initial_state
@@ -80,8 +81,8 @@ def quickened(scene: Scene) -> Scene:
 
 
 def stem(motion: str) -> str:
-    """The name of a motion alone."""
-    return Path(motion.removeprefix("ncs:")).stem
+    """The name of a motion's file alone, without its frames."""
+    return Path(split_frames(motion)[0].removeprefix("ncs:")).stem
 
 
 def without(scene: Scene, unseen: Sequence[str]) -> Scene:
@@ -94,7 +95,10 @@ def standing(scene: Scene, motions: Sequence[str], kept: Path) -> tuple[str, ...
     """The motions; of one that ends standing, a file with its last pose held for `STAND` seconds more."""
     found = []
     for motion in motions:
-        file, record = kept / "motions" / f"{stem(motion)}.npz", read_motion(scene.path(motion))
+        name, frames = split_frames(motion)
+        chosen = None if frames is None else (frames[0], frames[1] if len(frames) > 1 else None)
+        file = kept / "motions" / f"{'_'.join([stem(name), *map(str, frames or ())])}.npz"
+        record = read_motion(scene.path(name), frame_range=chosen)
         plain = record.joints is None and not record.up  # of another skeleton or another up, its file says more
         if plain and len(record.poses) > record.fps and not np.any(record.poses[-round(record.fps / 2) :] - record.poses[-1]):
             poses, way = (

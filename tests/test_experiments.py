@@ -26,8 +26,8 @@ from experiments import (
     stability,
     study,
 )
-from ncs_jax import InputError, assemble
-from ncs_jax.io import read_body
+from ncs_jax import InputError, assemble, load_scene
+from ncs_jax.io import read_body, read_motion
 from ncs_jax.io.packaged import packaged
 
 from .scenes import FREE, SCENE, swing, write_scene
@@ -134,6 +134,16 @@ def test_fast_motion(tmp_path):
         rows = {row["cell"]: row for row in csv.DictReader(file)}
     assert list(rows) == ["gated", "swing", "swing, alpha = 0"] and all(float(row["energy"]) > 0 for row in rows.values())
     assert float(rows["swing"]["stopped"]) > 0 and fast_motion.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+def test_a_part_of_a_motion_is_held_where_it_ends_standing(tmp_path):
+    """Its frames are those in its name, and a part is not taken for the whole or for another part."""
+    scene = load_scene("ncs:tshirt")
+    whole_, part = study.standing(scene, ("ncs:walk_turn_stop", "ncs:walk_turn_stop[20:]"), tmp_path)
+    assert whole_ != part and study.stem("ncs:walk_turn_stop[20:]") == "walk_turn_stop"
+    found, all_ = (read_motion(path).poses for path in (part, whole_))
+    np.testing.assert_array_equal(found, all_[20:])
+    assert study.standing(scene, ("ncs:walk[0:30]",), tmp_path) == ("ncs:walk[0:30]",)
 
 
 def test_the_page_is_what_its_tables_say():

@@ -19,13 +19,14 @@ from ncs_jax.energies.terms import MEASURED, NAMES
 from ncs_jax.errors import InputError
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.posing import skinned
 from ncs_jax.scene.spec import scene_from
 from ncs_jax.view import curves, pictures
 from ncs_jax.view.animation import Animation, PosedBody, upright
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.character import body_vertices
 from ncs_jax.view.ground import Ground
-from ncs_jax.view.motion_sheet import MARGIN, TILE, TITLE, _skinned, motion_sheet, posed
+from ncs_jax.view.motion_sheet import MARGIN, TILE, TITLE, motion_sheet, posed
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
@@ -397,4 +398,6 @@ def test_the_character_of_a_sheet_is_posed_as_everywhere(rng: np.random.Generato
     body = replace(body, rest_rotations=Rotation.random(len(body.parents), rng=rng).as_matrix())
     motion = io.MotionRecord(rng.normal(size=(3, len(body.parents), 3)), rng.normal(size=(3, 3)), 30.0)
     matrices = posed(body, motion, np.array([0, 2]))
-    np.testing.assert_allclose(_skinned(matrices, body.weights, body.vertices), body_vertices(body, motion)[[0, 2]], atol=2e-5)
+    np.testing.assert_allclose(
+        [skinned(body.vertices, body.weights, each) for each in matrices], body_vertices(body, motion)[[0, 2]], atol=2e-5
+    )

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,7 @@ CLOSE = 0.001, 2.0  # m and degrees
 BONES = [(f"{side}{a}", f"{side}{b}") for side in ("Left", "Right")
          for a, b in (("Arm", "ForeArm"), ("ForeArm", "Hand"), ("UpLeg", "Leg"), ("Leg", "Foot"))]  # fmt: skip
 TRUNK = re.compile(r"Hips|Spine|LowerBack|Neck|Shoulder|Foot$")
-KINDS = {"body": io.read_body, "garment": io.read_garment, "motion": io.read_motion}
+KINDS: dict[str, Callable] = {"body": io.read_body, "garment": io.read_garment, "motion": io.read_motion}
 SUFFIXES = {
     "body": {".npz", ".glb", ".gltf", ".vrm", ".fbx", ".obj"},
     "garment": {".obj", ".ply", ".stl", ".usd", ".usda", ".usdc", ".usdz"},
@@ -208,7 +209,7 @@ def main(folders: list[str]) -> int:
     good = True
     for folder in sorted({file.parent for top in folders for file in Path(top).rglob("*") if file.is_file()}):
         print(folder.name)
-        motions = {}
+        motions: dict[str, MotionRecord] = {}
         for file in sorted(folder.iterdir()):
             if not file.is_file() or file.suffix.lower() == ".md":
                 continue

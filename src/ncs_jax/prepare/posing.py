@@ -9,7 +9,7 @@ import numpy as np
 from ncs_jax.geometry.skinning import Blend, Correctives
 from ncs_jax.io.records import BodyRecord
 
-__all__ = ["carried", "corrected_rest", "joint_places", "joint_transforms", "world_axes", "world_turns"]
+__all__ = ["carried", "corrected_rest", "joint_places", "joint_transforms", "skinned", "world_axes", "world_turns"]
 
 
 def world_axes(poses: np.ndarray, rest_rotations: np.ndarray | None) -> np.ndarray:
@@ -54,8 +54,12 @@ def joint_transforms(body: BodyRecord, poses: np.ndarray) -> np.ndarray:
 
 def carried(rest: np.ndarray, weights: Blend, transforms: np.ndarray) -> np.ndarray:
     """Return vertices (verts, 3), m, in one pose, by linear blend skinning of those at rest; transforms (joints, 3, 4)."""
-    used = transforms[list(weights.joints)].reshape(-1, 12)
-    blended = (np.asarray(weights.weights, np.float64) @ used).reshape(-1, 3, 4)
+    return skinned(rest, np.asarray(weights.weights, np.float64), transforms[list(weights.joints)])
+
+
+def skinned(rest: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Return points (verts, 3) that joints carry from rest, x = sum_j w_j M_j (x0, 1); weights (verts, joints)."""
+    blended = (weights @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
     return np.einsum("vab,vb->va", blended[:, :, :3], rest) + blended[:, :, 3]
 
 

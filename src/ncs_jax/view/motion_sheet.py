@@ -18,7 +18,7 @@ from ncs_jax.errors import required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import side_and_rest
-from ncs_jax.prepare.posing import joint_transforms
+from ncs_jax.prepare.posing import joint_transforms, skinned
 from ncs_jax.prepare.setting import Setting
 from ncs_jax.view.animation import upright
 from ncs_jax.view.camera import Camera
@@ -68,8 +68,8 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
     matrices = posed(body, record, frames)
     joints = np.einsum("njab,jb->nja", matrices[..., :3], body.joints) + matrices[..., 3]
     rest, garment = upright(body.vertices, up), setting.garment
-    skin = upright(_skinned(matrices, body.weights, body.vertices), up)
-    cloth = upright(_skinned(matrices, setting.prepared.weights, garment.vertices), up)
+    skin = upright(np.array([skinned(body.vertices, body.weights, each) for each in matrices]), up)
+    cloth = upright(np.array([skinned(garment.vertices, setting.prepared.weights, each) for each in matrices]), up)
     floor = float(rest[:, 1].min())
     source = record.source or SkeletonPoses(joints, body.parents, body.joint_names or ("",) * len(body.parents))
     bones = upright(source.places[: len(frames)], up)
@@ -102,16 +102,6 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
         ImageDraw.Draw(label).text((height / 2, MARGIN / 2), words, 255, ImageFont.load_default(12), "mm")
         image.paste(FAINT, (0, TITLE + row * height), label.rotate(90, expand=True))
     return image
-
-
-def _skinned(matrices: np.ndarray, weights: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return points (n, V, 3) that joints carry from rest, x = sum_j w_j M_j (x0, 1)."""
-    found = []
-    weights, rest = weights.astype(np.float32), rest.astype(np.float32)
-    for each in matrices.astype(np.float32):
-        blended = (weights @ each.reshape(len(each), 12)).reshape(-1, 3, 4)
-        found.append(np.einsum("vab,vb->va", blended[:, :, :3], rest) + blended[:, :, 3])
-    return np.array(found)
 
 
 def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, floor: float) -> Image.Image:

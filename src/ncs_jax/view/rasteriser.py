@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.view.camera import Camera, Projection
 from ncs_jax.view.depth_buffer import rasterise
 from ncs_jax.view.ground import Ground, draw_ground
@@ -93,7 +94,7 @@ def _joined(meshes: Sequence[DrawnMesh]) -> _Surface:
         good = np.isfinite(v).all(1) & (np.abs(np.nan_to_num(v)) < 1e6).all(1)
         v, f = np.where(good[:, None], v, 0.0), f[good[f].all(1)]
         vertices.append(v)
-        normals.append(_normals(v, f))
+        normals.append(vertex_normals(v, f))
         faces.append(f + count)
         outside.append(np.broadcast_to(linear(mesh.colour), v.shape))
         hidden = np.full(3, np.nan) if mesh.inside is None else linear(mesh.inside)
@@ -102,15 +103,6 @@ def _joined(meshes: Sequence[DrawnMesh]) -> _Surface:
     if not vertices:
         return _Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int64), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((0, 3)))
     return _Surface(*(np.concatenate(part) for part in (vertices, faces, normals, outside, inside)))
-
-
-def _normals(vertices, faces):
-    """Return vertex normals (V, 3): face normals weighted by area; zero for a vertex without a face."""
-    p = vertices[faces]
-    n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    corners = faces.ravel()
-    total = np.stack([np.bincount(corners, np.repeat(n[:, i], 3), len(vertices)) for i in range(3)], 1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 def _draw_surface(image, surface: _Surface, projection: Projection, screen, shadows: ShadowMap) -> None:
