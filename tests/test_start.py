@@ -18,16 +18,20 @@ from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.geometry.surface_distance import closest_on_surface, distance_and_direction, signed_distance
 from ncs_jax.prepare.kept import kept
-from ncs_jax.simulation.ritz_modes import _Band
 
 from .scenes import SCENE, write_scene
 
 SOURCE = str(Path(__file__).parents[1] / "src")
 WORDS = (["--help"], ["train", "--help"], ["train", "--wrong"], ["nothing"], ["check", "--fields"], ["check", "no.toml"])
+MISSING = (
+    ["train", "no.toml", "--out", "r"], ["simulate", "no.toml", "--out", "r.npz"], ["evaluate", "no"],
+    ["animate", "no", "--out", "a.npz"], ["export", "no", "--out", "a.onnx"], ["preview", "no"], ["view", "no"],
+    ["fit", "no.obj", "--out", "a.npz"],
+)  # fmt: skip
 LIGHT = f"""
 import contextlib, json, sys
 from ncs_jax.cli.parser import main
-for words in {[*WORDS, ["train", "no.toml", "--out", "r"], ["simulate", "no.toml", "--out", "r.npz"], ["evaluate", "no"]]}:
+for words in {[*WORDS, *MISSING]}:
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(None):
         main(words)
     print(json.dumps([words, sorted({{"jax", "numpy"}} & set(sys.modules))]))
@@ -54,7 +58,7 @@ def printed(script, *arguments, folder):
 
 def test_words_and_missing_files_do_not_wait_for_jax(tmp_path):
     rows = printed(LIGHT, folder=tmp_path)
-    assert len(rows) == len(WORDS) + 3
+    assert len(rows) == len(WORDS) + len(MISSING)
     assert not [row for row in rows if row[1]]
 
 
@@ -110,20 +114,6 @@ def test_the_closest_point_is_on_its_triangle():
     np.testing.assert_allclose(points.weights.sum(axis=1), 1)
     assert (points.weights >= 0).all()
     np.testing.assert_allclose(x - there, points.gap, atol=1e-12)
-
-
-def test_a_band_solves_as_a_dense_matrix_does():
-    rng, verts = np.random.default_rng(0), 12
-    pairs = np.array([(i, j) for i in range(verts) for j in range(i) if rng.random() < 0.4])
-    off, right = rng.normal(size=(len(pairs), 3, 3)), rng.normal(size=3 * verts)
-    diagonal = 40 * np.eye(3) + rng.normal(size=(verts, 3, 3))
-    diagonal = (diagonal + np.swapaxes(diagonal, 1, 2)) / 2
-    dense = np.zeros((verts, 3, verts, 3))
-    dense[range(verts), :, range(verts)] = diagonal
-    dense[pairs[:, 0], :, pairs[:, 1]] = off
-    dense[pairs[:, 1], :, pairs[:, 0]] = np.swapaxes(off, 1, 2)
-    found = _Band(pairs, verts).solved(diagonal, off, right)
-    np.testing.assert_allclose(found, np.linalg.solve(dense.reshape(3 * verts, -1), right), rtol=1e-10)
 
 
 @pytest.fixture

@@ -44,6 +44,7 @@ def add_commands(commands) -> None:
 
 def animate(options) -> int:
     """Animate a trained garment over a motion, and write it to a file."""
+    arguments.check_run(options.folder)
     import numpy as np
 
     from ncs_jax import io
@@ -77,6 +78,7 @@ def animate(options) -> int:
 
 def export(options) -> int:
     """Write one step of a trained garment as a file, and print how it was checked."""
+    arguments.check_run(options.folder)
     from ncs_jax.export.facts import FileFormat
     from ncs_jax.runs.run import load_run
 

@@ -10,7 +10,22 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["FORMATS", "add_body", "body_of", "body_table", "command", "finite", "hosts", "positive", "seed", "whole"]
+from ncs_jax.errors import InputError
+
+__all__ = [
+    "FORMATS",
+    "add_body",
+    "body_of",
+    "body_table",
+    "check_file",
+    "check_run",
+    "command",
+    "finite",
+    "hosts",
+    "positive",
+    "seed",
+    "whole",
+]
 
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
@@ -29,6 +44,18 @@ def add_body(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
     )
+
+
+def check_file(name: str) -> None:
+    """Raise an InputError where a file or folder is not there: at once, before JAX is imported, which takes seconds."""
+    if not name.startswith("ncs:") and not Path(name).exists():
+        raise InputError("no such file", file=name, mend="check the path")
+
+
+def check_run(folder: str) -> None:
+    """Raise an InputError where a folder is not a run's: at once, as `check_file`."""
+    if not (Path(folder) / "run.json").exists():
+        raise InputError("no run there", file=Path(folder) / "run.json", mend="give a folder that ncs train made")
 
 
 def body_of(options):

@@ -54,6 +54,8 @@ def add_commands(commands) -> None:
 
 def fit(options) -> int:
     """Fit a garment to a body, write it with a picture and a scene, and print what was done to it."""
+    for name in (options.garment, options.body):
+        arguments.check_file(name)
     from ncs_jax import io
     from ncs_jax.prepare.fit import settle
     from ncs_jax.prepare.garment_placement import place

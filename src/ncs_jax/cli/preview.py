@@ -21,6 +21,7 @@ def add_commands(commands) -> None:
 
 def preview(options) -> int:
     """Draw a run, and print how it does on the motion."""
+    arguments.check_run(options.folder)
     from ncs_jax.runs.run import load_run
 
     draw(load_run(options.folder), options.out or options.folder, options.motion, log=Path(options.folder) / "log.csv")

@@ -26,6 +26,8 @@ def add_commands(commands) -> None:
 
 def view(options) -> int:
     """Serve the page until it is interrupted."""
+    for name in (options.target, *options.overlay):
+        arguments.check_file(name)
     from ncs_jax.view import live
 
     window = live.view(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ncs_jax.energies.inertia import G, out_of_balance
+from ncs_jax.errors import InputWarning
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.skinning import blend, skin
@@ -17,11 +19,13 @@ from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
 from ncs_jax.scene.step_inputs import Past, step_inputs
 from ncs_jax.simulation.solver.problem import (
+    LEAST_STEP,
     TALL,
     Problem,
+    accepts,
     evaluate,
     find_neighbours,
-    line_search,
+    share_outside_body,
     static_step,
     stiffness_blocks,
     with_neighbours,
@@ -33,7 +37,6 @@ __all__ = ["softest_ritz_modes"]
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
 STEPS = 200  # of Newton's method to the drape
 ENOUGH = {np.dtype(np.float32): 0.3, np.dtype(np.float64): 0.01}  # m/s^2: the acceleration that may be left there
-LARGEST = 1 << 29  # bytes of a band; of a larger garment a sparse factor is smaller
 LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
@@ -56,9 +59,11 @@ def _evaluated(problem: Problem, x):
 
 
 @jax.jit
-def _descended(problem: Problem, x, point, p):
-    x, *_, moved = line_search(problem, problem.neighbours, x, point, p)
-    return x, moved
+def _longest(point, p):
+    return jnp.min(share_outside_body(point.contact, p))
+
+
+_accepted = jax.jit(accepts)
 
 
 def _matrix(problem: Problem, diagonal, off):
@@ -80,68 +85,31 @@ def _solved(matrix, right):
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
 
 
-class _Band:
-    """Matrices of blocks as a band about their diagonal, which LAPACK factorises in half the time that a sparse one takes."""
-
-    def __init__(self, pairs: np.ndarray, verts: int):
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-        graph = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(verts, verts))
-        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
-        place = np.argsort(order)
-        i, j = (3 * place[pairs[:, k], None, None] for k in (0, 1))
-        rows, columns = np.broadcast_arrays(i + np.arange(3)[:, None], j + np.arange(3))
-        own = 3 * place[:, None] + np.array([0, 1, 2, 1, 2, 2]), 3 * place[:, None] + np.array([0, 0, 0, 1, 1, 2])
-        low = np.concatenate([np.maximum(rows, columns).ravel(), own[0].ravel()])
-        high = np.concatenate([np.minimum(rows, columns).ravel(), own[1].ravel()])
-        self._at, self._order = (low - high, high), (3 * order[:, None] + np.arange(3)).ravel()
-        self._shape = int((low - high).max()) + 1, 3 * verts
-
-    @property
-    def size(self) -> int:
-        """Return how many bytes a matrix takes."""
-        return 8 * self._shape[0] * self._shape[1]
-
-    def solved(self, diagonal, off, right) -> np.ndarray:
-        """Return the solution of a positive definite system.
-
-        Raises:
-            LinAlgError: it is not.
-        """
-        from scipy.linalg import solveh_banded
-
-        band = np.zeros(self._shape)
-        lower = ((diagonal + np.swapaxes(diagonal, 1, 2)) / 2)[:, [0, 1, 2, 1, 2, 2], [0, 0, 0, 1, 1, 2]]
-        band[self._at] = np.concatenate([off.ravel(), lower.ravel()])
-        solution = np.empty_like(right)
-        given = {"overwrite_ab": True, "lower": True, "check_finite": False}
-        solution[self._order] = solveh_banded(band, right[self._order], **given)
-        return solution
-
-
 def _drape(problem: Problem, x):
-    """The problem and the blocks at the static equilibrium x_0, found by Newton's method from x.
+    """The blocks at the static equilibrium x_0, found by Newton's method from x; warn where it is not reached.
 
-    What `implicit_euler` does, on the host: that is slower a step, and has no factorisation of its own to compile.
+    What `implicit_euler` does, on the host: that is slower a step, and has no factorisation of its own to compile. A loose
+    garment without friction slides down the body for hundreds of steps. Its frequencies change little there, its modes do.
     """
-    band = _Band(np.asarray(problem.couplings.pairs), len(x))
+    known = _evaluated(problem, x)
     for _ in range(STEPS):
-        near, point, found = _evaluated(problem, x)
+        near, point, found = known
         diagonal, off = (np.asarray(block, np.float64) for block in found)
         if G * out_of_balance(point.gradient, near.mass) < ENOUGH[x.dtype]:
+            return diagonal, off
+        p = _solved(_matrix(problem, diagonal, off), -np.asarray(point.gradient, np.float64).ravel())
+        p = jnp.asarray(p.reshape(x.shape), x.dtype)
+        t = float(_longest(point, p))
+        while not _accepted(point, (known := _evaluated(problem, x + t * p))[1], t, p):
+            t /= 2
+            if t < LEAST_STEP:
+                break
+        if t < LEAST_STEP:
             break
-        right = -np.asarray(point.gradient, np.float64).ravel()
-        try:
-            if band.size > LARGEST:
-                raise np.linalg.LinAlgError
-            p = band.solved(diagonal, off, right)
-        except np.linalg.LinAlgError:  # not quite positive definite
-            p = _solved(_matrix(problem, diagonal, off), right)
-        x, moved = _descended(near, x, point, jnp.asarray(p.reshape(x.shape), x.dtype))
-        if not moved:
-            break
-    return near, diagonal, off
+        x = x + t * p
+    told = "the garment came to no rest on the body, so the periods that its swing is made of are rough"
+    warnings.warn(f"{told}; if it swings too fast or too slowly, choose another network.cell", InputWarning, stacklevel=2)
+    return diagonal, off
 
 
 def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
@@ -166,17 +134,19 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     from scipy.sparse import diags
 
     problem, transforms = _still(model, track)
-    problem, diagonal, off = _drape(problem, skin(transforms, model.garment.mesh.rest))
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
-    added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
-    stiff, masses = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3)), diags(np.repeat(mass, 3))
     held = np.asarray(model.garment.pins) if model.terms.pinning else ()
     rest, area = (np.asarray(a, np.float64) for a in (mesh.rest, mesh.vertex_area))
     smooth = modal_basis(rest, np.asarray(mesh.faces), area, -(-count // 3), held=held)
     if not smooth.size:
         return None
+    added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
+    masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
+
+    diagonal, off = _drape(problem, skin(transforms, mesh.rest))
+    stiff = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3))
     u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
     squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
     if squares[0] < least:

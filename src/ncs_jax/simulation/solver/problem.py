@@ -27,10 +27,12 @@ from ncs_jax.simulation.solver.contact import Contact, evaluate_contact
 from ncs_jax.simulation.solver.stiffness import Couplings, stiffness
 
 __all__ = [
+    "LEAST_STEP",
     "TALL",
     "Neighbours",
     "Point",
     "Problem",
+    "accepts",
     "body_contact",
     "collision_free_step",
     "dot",
@@ -269,6 +271,16 @@ def share_outside_body(contact: Contact | None, p: Float[Array, "verts 3"]):
     return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
 
 
+def accepts(point: Point, new: Point, t, p: Float[Array, "verts 3"]):
+    """Return whether the energy falls enough from a place to one that is t p away."""
+    slope = dot(point.gradient, p)
+    noise = 16 * jnp.finfo(p.dtype).eps * jnp.abs(point.value)  # of a sum over a garment; with 4 eps float32 stalls
+    lower = new.value <= point.value + 1e-4 * t * slope
+    # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
+    level = (jnp.abs(new.value - point.value) <= noise) & (dot(new.gradient, p) <= 0) & (-t * slope <= noise)
+    return lower | level
+
+
 def line_search(
     problem: Problem, neighbours: Neighbours | None, x: Float[Array, "verts 3"], point: Point, p: Float[Array, "verts 3"]
 ):
@@ -276,19 +288,13 @@ def line_search(
 
     neighbours: found anew where a step goes far; None: as the problem knows them.
     """
-    slope = dot(point.gradient, p)
-    noise = 16 * jnp.finfo(x.dtype).eps * jnp.abs(point.value)  # of a sum over a garment; with 4 eps float32 stalls
-
     longest = jnp.min(share_outside_body(point.contact, p))
     if problem.model.terms.self_contact:
         longest = jnp.minimum(longest, collision_free_step(with_neighbours(problem, neighbours), x, p))
 
     def too_long(search):
         t, new, _ = search
-        lower = new.value <= point.value + 1e-4 * t * slope
-        # Where the fall is less than the energy's rounding, the slope tells: it must not have turned.
-        level = (jnp.abs(new.value - point.value) <= noise) & (dot(new.gradient, p) <= 0) & (-t * slope <= noise)
-        return (t > longest) | ~(lower | level) & (t > LEAST_STEP)
+        return (t > longest) | ~accepts(point, new, t, p) & (t > LEAST_STEP)
 
     def shorter(search):
         t = search[0] / 2
