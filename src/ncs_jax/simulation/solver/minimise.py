@@ -35,7 +35,13 @@ LOCAL = 20  # steps of a patch
 
 @dataclass(frozen=True)
 class Settings:
-    """How a frame is solved."""
+    """How a frame is solved.
+
+    solver: "newton" or "quasi_newton", see `directions`. tolerance: out-of-balance acceleration, the mass-weighted r.m.s. of
+    M^-1 grad E, in multiples of 9.81 m/s^2; None: 0.1 in float32, 0.001 in float64. iterations: at most, a frame; first: of the
+    first frame, which starts far from rest. inertia: False: every frame is the static state in its pose. exact_pins: pins are
+    held where the body carries them; otherwise by the scene's springs.
+    """
 
     solver: str = "newton"  # or "quasi_newton", see `directions`
     tolerance: float | None = None  # out-of-balance acceleration in g; None: 0.1 in float32, 0.001 in float64
@@ -51,7 +57,7 @@ class Solution:
     """How the solve of a frame went.
 
     residual: out-of-balance acceleration, the mass-weighted r.m.s. of M^-1 grad E, in multiples of 9.81 m/s^2.
-    status: CONVERGED, LIMIT (out of iterations), STALLED (no step lowers the energy) or NOT_FINITE.
+    status: CONVERGED (0), LIMIT (1, out of iterations), STALLED (2, no step lowers the energy) or NOT_FINITE (3).
     """
 
     iterations: Int[Array, "*frames"]
