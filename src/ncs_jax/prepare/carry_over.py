@@ -156,7 +156,7 @@ def _maps(source: BodyRecord, target: BodyRecord, file: str | Path) -> tuple[np.
         axis = np.zeros(3)
         if part in ours.end and part in theirs.end:
             axis, wanted = ours.end[part] - ours.begin[part], theirs.end[part] - theirs.begin[part]
-            length = np.linalg.norm(wanted) / np.linalg.norm(axis)
+            length = float(np.linalg.norm(wanted) / np.linalg.norm(axis))
             turn, axis = least_turn(turn @ axis, wanted) @ turn, axis / np.linalg.norm(axis)
         girth = girth or length or 1.0
         linear = turn @ (girth * np.eye(3) + (length - girth) * np.outer(axis, axis))
