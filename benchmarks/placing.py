@@ -5,9 +5,9 @@
 Garments of three bodies: the packaged one; a wider, smaller one that was written as .glb and read again; SMPL's, where
 `--shared` has it. On each: shells of its own skin (a top, long sleeves, leggings, shorts), a skirt and a loose dress that hang
 around it, and what was made for it elsewhere (the packaged garments; SMPL's T-shirt and those of GAPS). A case takes one, in
-a random unit, with a random axis up, up to 30 cm off its place along each axis. It is placed where it comes within 2 cm (mean
-over its vertices) of
-where it was made, in its unit; wrong where it is accepted elsewhere.
+a random unit, with a random axis up, turned about the vertical by a random quarter, up to 30 cm off its place along each axis.
+It is placed where it comes within 2 cm (mean over its vertices) of where it was made, in its unit; wrong where it is accepted
+elsewhere.
 """
 
 from __future__ import annotations
@@ -141,15 +141,17 @@ def _at_home(garment: GarmentRecord, body: BodyRecord) -> GarmentRecord:
 
 def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator) -> dict:
     """Return how one garment is placed from a random unit, axis and offset: what came out, its error, m, and why not."""
-    unit, up = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)]
-    x = (garment.vertices + rng.uniform(-OFFSET, OFFSET, 3)) @ TURNS[up].T / unit
+    unit, up, quarters = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)], int(rng.integers(4))
+    case = {"unit": unit, "up": up, "turn": 90 * quarters}
+    quarter = np.linalg.matrix_power(np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]), quarters)
+    x = (garment.vertices @ quarter + rng.uniform(-OFFSET, OFFSET, 3)) @ TURNS[up].T / unit
     try:
         found = place("garment", replace(garment, vertices=x.astype(np.float32), weights=None), body)
     except InputError as error:
-        return {"outcome": "refused", "error": None, "why": str(error), "unit": unit, "up": up}
+        return {"outcome": "refused", "error": None, "why": str(error), **case}
     away = float(np.linalg.norm(found.garment.vertices - garment.vertices, axis=1).mean())
     outcome = "refused" if found.doubt else "placed" if away <= RIGHT and np.isclose(found.scale, unit) else "wrong"
-    return {"outcome": outcome, "error": away, "why": found.doubt, "unit": unit, "up": up}
+    return {"outcome": outcome, "error": away, "why": found.doubt, **case}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -167,7 +169,9 @@ def main(arguments: list[str] | None = None) -> int:
         row = {"garment": name, **tried(garment, body, rng)}
         rows.append(row)
         error = "" if row["error"] is None else f"{1000 * row['error']:.0f} mm"
-        print(f"{name:28} {row['unit']:7g} {row['up']}  {row['outcome']:8} {error:>8}  {row['why']}", flush=True)
+        print(
+            f"{name:28} {row['unit']:7g} {row['up']} {row['turn']:3}  {row['outcome']:8} {error:>8}  {row['why']}", flush=True
+        )
     counts = {what: sum(row["outcome"] == what for row in rows) for what in ("placed", "refused", "wrong")}
     worst = max((row["error"] for row in rows if row["outcome"] == "placed"), default=0.0)
     print(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +29,9 @@ def add_commands(commands) -> None:
     )
     parser.add_argument("garment", metavar="GARMENT", help="mesh file: .npz, .obj, .ply, .stl, .glb, .vrm, .fbx, .usd*")
     arguments.add_body(parser)
+    parser.add_argument(
+        "--from", dest="source", metavar="BODY", help="body that it was made for, if another: it is carried over from there"
+    )
     parser.add_argument("--mesh", nargs="+", default=[], metavar="NAME", help="meshes of the file that are the garment")
     parser.add_argument(
         "--out", required=True, metavar="FILE", help=".npz; beside it a picture, .png, and a scene, .toml, if there is none yet"
@@ -54,7 +59,7 @@ def add_commands(commands) -> None:
 
 def fit(options) -> int:
     """Fit a garment to a body, write it with a picture and a scene, and print what was done to it."""
-    for name in (options.garment, options.body):
+    for name in filter(None, (options.garment, options.body, options.source)):
         arguments.check_file(name)
     from ncs_jax import io
     from ncs_jax.prepare.fit import settle
@@ -67,22 +72,25 @@ def fit(options) -> int:
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
         )
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
-    given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), body)
+    source = io.read_body(options.source) if options.source else body
+    given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), source)
     known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
     move = (0.0, 0.0, 0.0) if options.stay else options.move
-    placement = place(options.garment, given, body, move=move, **known)
-    print(f"{options.garment} on {options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles")
+    placement = place(options.garment, given, source, move=move, **known)
+    print(
+        f"{options.garment} on {options.source or options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles"
+    )
     _say_where(placement)
     picture = out.with_suffix(".png")
-    try:
+    if options.source:
+        placement = _carried(options, picture, placement, source, body)
+        given = placement.garment
+    with _drawn(picture, body, placement):
         found = settle(options.garment, placement, body, clearance=options.clearance)
-    except InputError:
-        _draw(picture, body, given.faces, {"refused": placement.garment.vertices})
-        print(f"wrote {picture}: the best place that was found")
-        raise
     _say_what(found, given)
     io.write_garment(out, found.garment)
-    _draw(picture, body, given.faces, {"placed": placement.garment.vertices, "out of the body": found.garment.vertices})
+    label = "carried over" if options.source else "placed"
+    _draw(picture, body, given.faces, {label: placement.garment.vertices, "out of the body": found.garment.vertices})
     text = _scene(options, out, found, body)
     print(f"wrote {out} and {picture}")
     file = out.with_suffix(".toml")
@@ -94,6 +102,37 @@ def fit(options) -> int:
     return 0
 
 
+@contextmanager
+def _drawn(picture: Path, body, placement) -> Iterator[None]:
+    """Draw a garment on the body at its place where what follows refuses it."""
+    try:
+        yield
+    except InputError:
+        _draw(picture, body, placement.garment.faces, {"refused": placement.garment.vertices})
+        print(f"wrote {picture}: the best place that was found")
+        raise
+
+
+def _carried(options, picture: Path, placement, source, body):
+    """Return the garment's place on the body, to which it is carried over from the source, and print what that did to it."""
+    import numpy as np
+
+    from ncs_jax.prepare.carry_over import carry_over
+    from ncs_jax.prepare.garment_placement import place
+
+    with _drawn(picture, source, placement):
+        placement.check(options.garment)
+    found = carry_over(placement.garment, source, body, options.source)
+    after = place(options.garment, found.garment, body, scale=1.0, up="y", turn=0, move=(0.0, 0.0, 0.0))
+    middle, high = (100 * float(np.percentile(found.strain, share)) for share in (50, 95))
+    print(f"carried over to {options.body}: {found.size:.2f} times as large")
+    print(f"  strain    of its edges besides: {middle:.0f} % median, {high:.0f} % for 95 of 100")
+    _say_lying(after)
+    with _drawn(picture, body, after):
+        found.check(options.garment, placement, after)
+    return after
+
+
 def _say_where(placement) -> None:
     """Print unit, axes and place, and how much of the garment lies on the body there."""
     moved = "not moved"
@@ -101,10 +140,7 @@ def _say_where(placement) -> None:
         moved = "moved by ({:.3f}, {:.3f}, {:.3f}) m".format(*placement.shift)
     turned = f", turned by {placement.turn} degrees" if placement.turn else ""
     print(f"  placed    {placement.scale:g} m a unit, {placement.up.upper()} up{turned}; {moved}")
-    print(
-        f"  lies      {100 * placement.lying:.0f} % on the skin, {100 * placement.inside:.0f} % inside the body; "
-        f"the body passes through {100 * placement.threaded:.0f} % of its openings"
-    )
+    _say_lying(placement)
     if placement.warning:
         print(f"  unsure    {placement.warning}. Look at the picture; --move if it is wrong")
     if placement.turn and not placement.doubt:
@@ -112,6 +148,14 @@ def _say_where(placement) -> None:
     if placement.mirrored:
         print("  mirrored  left and right were exchanged: its faces looked inward, as left-handed axes make them. If only the")
         print("            faces are wrong, turn them around in the modeller first")
+
+
+def _say_lying(placement) -> None:
+    """Print how much of a garment lies on the body."""
+    print(
+        f"  lies      {100 * placement.lying:.0f} % on the skin, {100 * placement.inside:.0f} % inside the body; "
+        f"the body passes through {100 * placement.threaded:.0f} % of its openings"
+    )
 
 
 def _say_what(found, given) -> None:

@@ -18,13 +18,13 @@ from ncs_jax.prepare.garment_checks import FAR
 from ncs_jax.prepare.garment_placement import Placement, place
 from ncs_jax.prepare.skinning_weights import transfer_weights
 
-__all__ = ["PINS", "Fitted", "fit", "pins_of", "push_out", "settle", "spread_weights"]
+__all__ = ["PINS", "Fitted", "fit", "lying_on", "pins_of", "push_out", "settle", "spread", "spread_weights"]
 
 PINS = "pins"  # the vertex group that is written
 PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
 NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
 LYING, SMOOTH = 0.02, 0.03  # m; see `spread_weights`
-LEAST = 1e-6  # how much the weights of cloth far from the body count
+LEAST = 1e-6  # how much what lies far from the body counts
 OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away from the body
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
 CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
@@ -170,15 +170,30 @@ def spread_weights(
     follows the cloth that it hangs on, and is not torn to either side. Weights are 0 to 1 and sum to 1, because the inverse of
     the system's matrix is positive. Source: the matching of Abdrashitov et al. 2023, with a smooth c_v instead of a threshold.
     """
+    edges = topology(garment.faces)[0]
+    own = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+    trust = lying_on(garment, distance, away)
+    weights = np.maximum(spread(garment.vertices, edges, trust, own), 0)
+    return weights / weights.sum(axis=1, keepdims=True), float((trust > 0.5).mean())
+
+
+def lying_on(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Return how much each vertex (V,) lies on the body, c of `spread_weights`, from 0 to 1."""
+    facing = np.maximum(np.sum(vertex_normals(garment.vertices, garment.faces) * away, axis=1), 0)
+    return np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing
+
+
+def spread(x: np.ndarray, edges: np.ndarray, trust: np.ndarray, values: np.ndarray, smooth: float = SMOOTH) -> np.ndarray:
+    """Return values (V, K) of a surface's vertices, smoothed, so that those of little `trust` (V,) follow those around them.
+
+        min_u  sum_v c_v (u_v - value_v)^2 + (L / l)^2 sum_(edges v-w) (u_v - u_w)^2,
+
+    with c the trust, l the mean edge and L the length to smooth over, m.
+    """
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
-    x, edges = garment.vertices, topology(garment.faces)[0]
-    own = transfer_weights(x, body.vertices, body.faces, body.weights)
-    facing = np.maximum(np.sum(vertex_normals(x, garment.faces) * away, axis=1), 0)
-    trust = np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing + LEAST
-    graph = adjacency(edges, len(x))
-    stiff = (SMOOTH / np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).mean()) ** 2
+    graph, trust = adjacency(edges, len(x)), trust + LEAST
+    stiff = (smooth / np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).mean()) ** 2
     system = diags_array(trust) + stiff * (diags_array(graph.sum(axis=1)) - graph)
-    weights = np.maximum(splu(system.tocsc()).solve(trust[:, None] * own), 0)
-    return weights / weights.sum(axis=1, keepdims=True), float((trust > 0.5).mean())
+    return splu(system.tocsc()).solve(trust[:, None] * values)

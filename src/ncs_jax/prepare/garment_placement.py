@@ -75,10 +75,11 @@ class Placement:
     def check(self, file: str | Path) -> None:
         """Raise an InputError where the place is in doubt."""
         if self.doubt:
+            other = "if it was made for another body, name that by --from; " if self.pierced or self.threaded <= 0.99 else ""
             raise InputError(
                 f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
-                value=f"as its best place {self.options}",
-                mend="if the picture is right, give these options; else others of --scale, --up, --turn and --move, or --stay",
+                value=f"as its best place {self.options}", mend=f"{other}if the picture is right, give these options; "
+                "else others of --scale, --up, --turn and --move, or --stay",
             )  # fmt: skip
 
 
