@@ -9,6 +9,7 @@ The motion file holds three arrays:
     poses  (frames, joints, 3)  how each joint of the body is turned: axis times angle, radians
     trans  (frames, 3)          where the root has moved from its place at rest, metres
     fps    ()                   frames per second
+    joint_names  (joints,)      if it is there, joints are found by name; else they are in the order of the body's file
 
 The result, vertices.npy, has shape (frames, vertices, 3) and is in metres. A fourth argument is alpha: 0 is static, 1 as
 trained.
@@ -43,6 +44,11 @@ def main(model, motion, out, alpha="1"):
     numbers = [joint["number"] for joint in facts["joints"]]  # the body's joints that the garment reads, in this order
 
     recording = np.load(motion)
+    if "joint_names" in recording:  # a file may have the body's joints in another order than the body's own
+        names = [str(name) for name in recording["joint_names"]]
+        if lacking := [joint["name"] for joint in facts["joints"] if joint["name"] not in names]:
+            raise SystemExit(f"{motion}: a motion of the garment's own body expected; it has no {', '.join(lacking)}")
+        numbers = [names.index(joint["name"]) for joint in facts["joints"]]
     fps = float(recording["fps"])
     if fps != facts["fps"]:
         raise SystemExit(f"{motion}: {fps} frames per second; the garment was trained at {facts['fps']}")

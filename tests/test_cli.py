@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from rich.console import Console
 from ncs_jax import io
 from ncs_jax.cli import check, main, preview
 from ncs_jax.cli.progress import WorkProgress
+from ncs_jax.cli.train import _TrainingBar
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.runs.run import load_run
@@ -394,6 +396,28 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys):
     assert last.startswith("ncs: warning: only 20 steps fitted in") and "--resume --minutes M goes on" in last
     with pytest.raises(SystemExit):
         main([*line, "--minutes", "1", "--steps", "30"])
+
+
+def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, capsys, monkeypatch):
+    """Ctrl-C between two reports: the steps under way are taken, kept, and gone on from by the command that it prints."""
+    scene, _ = run_folder
+    out, shown = tmp_path / "ein lauf", []
+    show, handler = _TrainingBar.show, signal.getsignal(signal.SIGINT)
+
+    def pressed(self, report):
+        show(self, report)
+        shown.append(report.step)
+        if len(shown) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(_TrainingBar, "show", pressed)
+    assert main(["train", str(scene), "--out", str(out), "--steps", "100"]) == 130
+    said = capsys.readouterr()
+    assert "stopping after these steps" in said.out and signal.getsignal(signal.SIGINT) is handler
+    assert said.err == f"ncs: interrupted; `ncs train {scene} --out '{out}' --resume` goes on from the last checkpoint\n"
+    assert shown == [10, 20] and load_run(out).steps == 30
+    assert main(["train", str(scene), "--out", str(out), "--resume", "--steps", "40"]) == 0
+    assert "step 40/40" in capsys.readouterr().out
 
 
 def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, monkeypatch):

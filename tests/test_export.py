@@ -336,6 +336,14 @@ def test_a_host_without_jax_plays_what_the_run_animates(tmp_path):
     assert done.stdout == "out.npy: 24 frames of 30 vertices\n", done.stderr
     want = run.animate(next(iter(assembly.motions)), 1.5)
     np.testing.assert_allclose(np.load(tmp_path / "out.npy"), want, rtol=0, atol=1e-5)
+    ours = swing()
+    joints = [joint["name"] for joint in json.loads((tmp_path / "step.onnx.json").read_text())["joints"]]
+    turned = dict(ours, poses=ours["poses"][:, ::-1], joint_names=np.array(joints[::-1]))
+    np.savez(tmp_path / "turned.npz", **turned)  # a file may have the joints in another order than the body
+    assert host(tmp_path, "step.onnx", "turned.npz", "out.npy", "1.5").returncode == 0
+    np.testing.assert_allclose(np.load(tmp_path / "out.npy"), want, rtol=0, atol=1e-5)
+    np.savez(tmp_path / "other.npz", **dict(ours, joint_names=np.array(["a", *joints[1:]])))
+    assert f"it has no {joints[0]}" in host(tmp_path, "step.onnx", "other.npz", "out.npy").stderr
     np.savez(tmp_path / "slow.npz", **swing(fps=24.0))
     assert "trained at 30.0" in host(tmp_path, "step.onnx", "slow.npz", "out.npy").stderr
     assert "vertices.npy" in host(tmp_path).stderr  # without arguments it says how it is used

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -98,7 +99,8 @@ def fit(options) -> int:
         print(f"kept {file}, which is there. A scene for this garment:\n\n{text}", end="")
     else:
         file.write_text(text)
-        print(f"wrote {file}, a scene to train:\n\n{text}\nnext: ncs check {file}, ncs train {file}")
+        name, run = shlex.quote(str(file)), shlex.quote(f"runs/{out.stem}")
+        print(f"wrote {file}, a scene to train:\n\n{text}\nnext: ncs check {name}, then ncs train {name} --out {run} --preview")
     return 0
 
 

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import gc
 import os
+import shlex
 import sys
 import warnings
 from importlib.metadata import version
@@ -36,8 +37,8 @@ KEPT = 2 << 30  # bytes of compiled programs, at most
 
 # What an interrupted command has kept.
 GOES_ON = {
-    train.train: "; `ncs train --resume` goes on from the last checkpoint",
-    train.demo: "; `ncs demo` goes on from the last checkpoint",
+    train.train: "; `ncs train {scene} --out {out} --resume` goes on from the last checkpoint",
+    train.demo: "; `ncs demo --out {out}` goes on from the last checkpoint",
     simulate.simulate: "; the same command goes on with the frames that are done",
 }
 
@@ -59,7 +60,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"ncs: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
-        print(f"ncs: interrupted{GOES_ON.get(parsed.run, '')}", file=sys.stderr)
+        given = {name: shlex.quote(value) for name, value in vars(parsed).items() if isinstance(value, str)}
+        print(f"ncs: interrupted{GOES_ON.get(parsed.run, '').format(**given)}", file=sys.stderr)
         code = 130
     if getattr(parsed, "hosts", None) is not None:
         train.leave(code)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
+import signal
 import sys
+import threading
 from pathlib import Path
 
 from ncs_jax.cli import arguments
@@ -69,7 +72,8 @@ def train(options) -> int:
     if jax.process_index() == 0:
         if options.preview:
             draw(run, options.out)
-        _warn_of_few_steps(run, options.minutes, f"ncs train {options.scene} --out {options.out} --resume --minutes M goes on")
+        given = shlex.join([options.scene, "--out", options.out])
+        _warn_of_few_steps(run, options.steps, f"ncs train {given} --resume --minutes M goes on")
     return 0
 
 
@@ -80,7 +84,7 @@ def demo(options) -> int:
     minutes = options.minutes if options.minutes or resume else DEMO_MINUTES
     run = _trained(load_scene(options.scene), out, minutes=minutes, resume=resume)
     draw(run, out)
-    _warn_of_few_steps(run, minutes, f"ncs demo --out {out} --minutes M goes on")
+    _warn_of_few_steps(run, None, f"ncs demo --out {shlex.quote(str(out))} --minutes M goes on")
     return 0
 
 
@@ -97,23 +101,24 @@ def _trained(scene, out, **chosen):
     return run
 
 
-def _warn_of_few_steps(run, minutes: float | None, mend: str) -> None:
-    """Say, at the very end, that a training by the clock was too short to be looked at."""
+def _warn_of_few_steps(run, steps: int | None, mend: str) -> None:
+    """Say, at the very end, that a training whose steps nobody chose was too short to be looked at."""
     from ncs_jax.runs.plan import ENOUGH
 
-    if minutes is not None and run.steps < ENOUGH:
+    if steps is None and run.steps < ENOUGH:
         what = f"only {run.steps} steps fitted in, too few to learn from: what was written shows no trained garment"
         print(f"ncs: warning: {what}; {mend}", file=sys.stderr)
 
 
 class _TrainingBar:
-    """Say how training goes. Only the first process does."""
+    """Say how training goes; only the first process does. Ctrl-C ends it after the chunk of steps under way, which is kept."""
 
     def __init__(self) -> None:
         import jax
 
         self._progress = WorkProgress("reading the scene and compiling", quiet=jax.process_index() > 0)
         self._devices = jax.device_count()
+        self._handler, self._stopped = None, False
         self.reports = 0
 
     def __enter__(self) -> _TrainingBar:
@@ -121,10 +126,29 @@ class _TrainingBar:
         return self
 
     def __exit__(self, *error) -> None:
+        self._let_go()
         self._progress.__exit__(*error)
 
+    def _stop(self, *_) -> None:
+        self._stopped = True
+        self._let_go()  # a second Ctrl-C does not wait
+        self._progress.say("stopping after these steps; Ctrl-C again stops at once")
+
+    def _let_go(self) -> None:
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
+            self._handler = None
+
     def show(self, r: Report) -> None:
-        """Show a report."""
+        """Show a report.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed since the last one.
+        """
+        if self._stopped:
+            raise KeyboardInterrupt
+        if not self.reports and self._devices == 1 and threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._stop)
         if self._devices > 1 and not self.reports:
             fewer = "" if r.devices == self._devices else ": no more of them divide training.batch"
             self._progress.say(f"training on {r.devices} of {self._devices} devices{fewer}")

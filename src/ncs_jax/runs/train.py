@@ -60,7 +60,7 @@ def train(
         resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned. Its scene and seed stand. The
             learning rate is that of a run of so many steps from its beginning.
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
-        report: called after every chunk of steps.
+        report: called after every chunk of steps; KeyboardInterrupt from it ends the run with a checkpoint of these steps.
         terms: of one's own, see `energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step inputs, in
             J.
         network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
@@ -218,7 +218,11 @@ class _Loop:
         if self._timed is None:  # this chunk was compiled
             trim_memory()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
-        self._output.tell(self._entry(done, here, energies))
+        try:
+            self._output.tell(self._entry(done, here, energies))
+        except KeyboardInterrupt:  # `report` ends the run
+            self._output.save(done, here)
+            raise
         whole = done % self._every == 0
         if whole or done == self._steps:
             self._output.save(done, here)
