@@ -14,6 +14,7 @@ from ncs_jax.scene.spec import load_scene, template
 
 if TYPE_CHECKING:
     from ncs_jax.io import MotionRecord
+    from ncs_jax.prepare.scene_checks import Risk
     from ncs_jax.prepare.setting import Setting
 
 __all__ = ["add_commands", "check"]
@@ -51,7 +52,7 @@ def check(options) -> int:
     _say("looking for risks")
     risks = find_risks(setting)
     groups = _alike(setting.motions)
-    drawn = _draw(options.out, setting, groups)
+    drawn = _draw(options.out, setting, _worst_first(groups, setting, risks))
     print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
     for risk in risks:
         _tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
@@ -142,6 +143,17 @@ def _tell_motions(setting: Setting, groups: Sequence[Sequence[str]]) -> None:
                     _tell("", f"{name}: {note}")
     if not setting.model.moves:
         print("  the character never moves: only the static network is trained")
+
+
+def _worst_first(groups: Sequence[Sequence[str]], setting: Setting, risks: Sequence[Risk]) -> list[list[str]]:
+    """Return groups of motions, and the names in each, those that a risk names first, then those that move most."""
+    risky = {name for name in setting.motions for risk in risks if re.search(re.escape(name) + r"(?![\w\[])", risk.value)}
+
+    def order(name: str) -> tuple[bool, float]:
+        poses = setting.motions[name].poses
+        return name not in risky, -float((poses.max(axis=0) - poses.min(axis=0)).sum())
+
+    return sorted((sorted(group, key=order) for group in groups), key=lambda group: order(group[0])[0])
 
 
 def _draw(out: str, setting: Setting, groups: Sequence[Sequence[str]]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import unicodedata
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -93,7 +94,8 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
         image.paste(_stick_figure(own, source, camera, floor), (place[0], place[1] + height))
     draw = ImageDraw.Draw(image)
     font = ImageFont.load_default(15)
-    draw.text((MARGIN, TITLE / 2), title, INK, font, "lm")
+    plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode()  # the font has no other letters
+    draw.text((MARGIN, TITLE / 2), plain, INK, font, "lm")
     for column, frame in enumerate(frames.tolist()):
         at = MARGIN + (column + 0.5) * width, TITLE + 2 * height + 10
         draw.text(at, f"{frame / record.fps:.2f} s", FAINT, ImageFont.load_default(13), "mm")
