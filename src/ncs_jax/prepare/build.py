@@ -108,9 +108,9 @@ def _training_features(setting: Setting) -> MotionFeatures:
 
 
 def _tell_a_person(words: str) -> None:
-    """Print what takes long to stderr, where a person sees it: in a terminal or a notebook."""
+    """Write what takes long to stderr, where a person sees it: in a terminal or a notebook."""
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
-        print(f"ncs_jax: {words} ...", file=sys.stderr, flush=True)
+        sys.stderr.write(f"ncs_jax: {words} ...\n")
 
 
 def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures, say) -> Prepared:

@@ -178,25 +178,23 @@ def animation_gif(
     path: str | Path,
     animation: Animation,
     *,
-    fps: float = 15.0,
     max_frames: int = 120,
     size: tuple[int, int] = (360, 450),
     view: str = "three-quarter",
     max_bytes: int = 6_000_000,
     report: Callable[[float], None] | None = None,
 ) -> None:
-    """Write an animated GIF that follows the character over a fixed grid.
+    """Write an animated GIF that follows the character over a fixed grid, at 15 frames per second or what comes closest.
 
     Args:
-        path: of the GIF. animation: to draw. fps: frames per second, or what comes closest. max_frames: of the GIF; a longer
-            animation is cut there. size: width and height in pixels. view: one of `VIEWS`. max_bytes: colours and then frames
-            are dropped until it is no larger.
+        path: of the GIF. animation: to draw. max_frames: of the GIF; a longer animation is cut there. size: width and height in
+            pixels. view: one of `VIEWS`. max_bytes: colours and then frames are dropped until it is no larger.
         report: called with the share of the frames that are drawn.
     """
     if view not in VIEWS:
         raise InputError(f"one of {', '.join(VIEWS)} expected", field="view", value=view)
-    stage = _stage(animation)
-    stride = max(1, math.floor(animation.fps / fps + 0.5))
+    stage, fps = _stage(animation), animation.fps
+    stride = max(1, math.floor(fps / 15 + 0.5))
     chosen = np.arange(0, stage.frames, stride)[: max(1, max_frames)]
     half = math.hypot(stage.half[0], stage.half[2]) if view not in ("front", "back") else stage.half[0]
     camera = Camera(stage.path[0], 2 * stage.half[1] * 1.16, 2 * half * 0.92, VIEWS[view], elevation=12.0)
@@ -213,7 +211,7 @@ def animation_gif(
                 report(len(pictures) / len(chosen))
     colours, step = 255, 1
     while True:
-        _write_gif(path, pictures[::step], stride * step / animation.fps, colours)
+        _write_gif(path, pictures[::step], stride * step / fps, colours)
         if Path(path).stat().st_size <= max_bytes or len(pictures) <= step:
             return
         colours, step = (128, step) if colours == 255 else (colours, step + 1)

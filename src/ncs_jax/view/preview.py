@@ -83,26 +83,28 @@ def preview(
         for alpha in (ALPHAS if controlled else (0.0,))
     }
     facts = {"motion": names[0], "trained": f"{run.steps} steps on {', '.join(scene.motion.files)}"}
-    encoded = page.encode(by_alpha)
-    write = functools.partial(page.write_encoded, played := folder / "preview.html", encoded, title=title, facts=facts)
-    write()
+    write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
+    write(facts=facts)
 
     tell(PreviewStep(played, "drawing the GIF", 0.3))
-    gif = folder / "preview.gif"
     drawing = lambda share: tell(PreviewStep(None, "drawing the GIF", 0.3 + 0.5 * share))  # noqa: E731
-    pictures.animation_gif(gif, animation, fps=FPS, max_frames=FRAMES, size=SIZE, report=drawing)
+    few = animation.every(max(1, round(animation.fps / FPS)))
+    pictures.animation_gif(gif := folder / "preview.gif", few, max_frames=FRAMES, size=SIZE, report=drawing)
 
     tell(PreviewStep(gif, "measuring strain and penetration", 0.8))
     if (drawn := _draw_curves(folder, Path(log or folder / "log.csv"))) is not None:
         tell(PreviewStep(drawn, "measuring strain and penetration", 0.8))
     quantities = _measured(run, animation)
-    every = f" (one frame in {quantities['every']:.0f})" if quantities["every"] > 1 else ""
-    facts["mean strain"] = f"{quantities['strain_mean']:.2f} %{every}"
-    if "penetrating" in quantities:
-        facts["penetrating vertices"] = f"{quantities['penetrating']:.2f} %{every}"
-    write()
+    write(facts=facts | _facts_of(quantities))
     tell(PreviewStep(None, "done", 1.0))
     return quantities
+
+
+def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
+    """Return what the page says of strain and penetration."""
+    every = f" (one frame in {quantities['every']:.0f})" if quantities["every"] > 1 else ""
+    names = {"strain_mean": "mean strain", "penetrating": "penetrating vertices"}
+    return {names[key]: f"{quantities[key]:.2f} %{every}" for key in names if key in quantities}
 
 
 def _measured(run: Run, animation: Animation) -> dict[str, float]:
