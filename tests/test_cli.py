@@ -27,6 +27,7 @@ from ncs_jax.prepare.joint_names import listed
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 from ncs_jax.view.character import body_vertices
+from ncs_jax.view.preview import preview as draw_preview
 
 from .characters import skinned
 from .scenes import grid, post, swing, write_scene
@@ -425,12 +426,22 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     _, folder = run_folder
     monkeypatch.setattr("ncs_jax.view.pictures.render", lambda *_, **__: np.zeros((520, 400, 3), np.uint8))
     shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
+    monkeypatch.setattr("ncs_jax.view.preview.MEASURED", 8)
     out = tmp_path / "drawn"
     assert main(["preview", str(folder), "--motion", str(tmp_path / "other.npz"), "--out", str(out)]) == 0
     text = capsys.readouterr().out
     written = [Path(line.strip()).name for line in text.splitlines() if line.startswith(f"  {out}")]
     assert written == ["preview.png", "preview.html", "preview.gif", "energies.png"]
-    assert re.search(r"other.npz, which it never trained on:\n  mean strain [0-9.]+ %, penetrating vertices", text)
+    assert re.search(
+        r"other.npz, which it never trained on, one frame in 3:\n  mean strain [0-9.]+ %, penetrating vertices", text
+    )
+    run = load_run(folder)
+    quick, rows = draw_preview(run, out, str(tmp_path / "other.npz")), run.evaluate(str(tmp_path / "other.npz"))
+    every = int(quick["every"])
+    assert every == 3 and rows["penetrating"][::every].any()
+    np.testing.assert_allclose(quick["strain_mean"], rows["strain_mean"][::every].mean(), rtol=1e-3)
+    np.testing.assert_allclose(quick["penetrating"], rows["penetrating"][::every].mean(), atol=1e-6)
+    np.testing.assert_allclose(quick["depth_max"], rows["depth_max"][::every].max(), atol=1e-2)
     page = (out / "preview.html").read_text()
     assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
 

@@ -18,6 +18,8 @@ from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.geometry.surface_distance import closest_on_surface, distance_and_direction, signed_distance
 from ncs_jax.prepare.kept import kept
+from ncs_jax.runs.run import assemble
+from ncs_jax.scene.spec import load_scene
 
 from .scenes import SCENE, write_scene
 
@@ -67,6 +69,18 @@ def test_a_check_compiles_next_to_nothing_and_loads_no_network(tmp_path):
     scene = write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))
     ((programs, heavy),) = printed(COUNTED, scene, folder=tmp_path)
     assert 0 < programs <= 10 and not heavy
+
+
+@pytest.mark.parametrize(("terminal", "told"), [(True, "ncs_jax: finding the garment's vibrations"), (False, "")])
+def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, capsys, terminal, told):
+    """No vibration is really looked for, and the gated cell takes the place of the swing."""
+    monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", lambda *_: None)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    scene = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', "")))  # "auto": a swing, if there is one
+    assemble(scene)
+    said = capsys.readouterr().err
+    assert told in said and bool(said) == terminal, said
 
 
 def ball(rows=9, around=14):

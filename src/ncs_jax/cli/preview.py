@@ -44,6 +44,7 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
     name = motion or (*scene.motion.validation, *scene.motion.files)[0]
     never = "" if _is_trained_on(scene.motion.files, name) else ", which it never trained on"
     inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
+    never += f", one frame in {quantities['every']:.0f}" if quantities["every"] > 1 else ""
     print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
     return quantities
 

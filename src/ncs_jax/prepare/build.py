@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -64,7 +65,8 @@ def build(
     Args:
         scene: from `load_scene`. prepared: that of a run, which needs no training motion any more; None: it is found out here.
         below: the trained garments of `garment.over`, each with the body that it was trained on.
-        dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words.
+        dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words; without
+            one, what takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
@@ -81,7 +83,7 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size:
             known = required(track, "vibrations", "train again into a new folder")
-            prepared = _with_vibrations(scene, prepared, model, faces, known)
+            prepared = _with_vibrations(scene, prepared, model, faces, known, report or _tell_a_person)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network_from(scene, model), track)
@@ -105,7 +107,13 @@ def _training_features(setting: Setting) -> MotionFeatures:
     return features_from_records(model, *motions)
 
 
-def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures) -> Prepared:
+def _tell_a_person(words: str) -> None:
+    """Write what takes long to stderr, where a person sees it: in a terminal or a notebook."""
+    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+        sys.stderr.write(f"ncs_jax: {words} ...\n")
+
+
+def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures, say) -> Prepared:
     """Add the garment's vibrations, if any, found with smooth contact, because a simulation converges with no other."""
     from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 
@@ -114,6 +122,7 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
     count = scene.network.vibrations
 
     def found() -> dict[str, np.ndarray] | None:
+        say("finding the garment's vibrations, which may take a minute")
         modes = softest_ritz_modes(model, track, count)
         if modes is None:
             return None

@@ -84,6 +84,11 @@ class Animation:
         body = None if self.body is None else replace(self.body, vertices=self.body.vertices[:end])
         return replace(self, garment=self.garment[:end], body=body)
 
+    def every(self, step: int) -> Animation:
+        """Return every `step`-th frame, from the first on, as fast as before."""
+        body = None if self.body is None else replace(self.body, vertices=self.body.vertices[::step])
+        return replace(self, garment=self.garment[::step], body=body, fps=self.fps / step)
+
 
 def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.ndarray:
     """Turn (..., 3) so that `up` becomes +Y, the shortest way: Z up facing -Y becomes Y up facing +Z."""

@@ -9,13 +9,14 @@ import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation
 
-__all__ = ["write_page"]
+__all__ = ["Encoded", "encode", "write_encoded", "write_page"]
 
 STEP = 5e-5
 """The grid that positions are rounded to, in m; coarser where one frame spans more than 3.2 m."""
@@ -36,7 +37,28 @@ def write_page(
     Raises:
         InputError: a position is not finite, or the animations differ by more than the garment's vertices.
     """
-    scene, data = _scene(_checked(animations))
+    write_encoded(path, encode(animations), title=title, facts=facts)
+
+
+class Encoded(NamedTuple):
+    """Animations as a page holds them: the facts of the scene, and its blocks of data by name."""
+
+    scene: dict[str, object]
+    data: dict[str, str]
+
+
+def encode(animations: Mapping[str, Animation]) -> Encoded:
+    """Return what a page holds of animations, which takes most of the time of writing one.
+
+    Raises:
+        InputError: as `write_page` does.
+    """
+    return _scene(_checked(animations))
+
+
+def write_encoded(path: str | Path, encoded: Encoded, *, title: str = "", facts: Mapping[str, str] | None = None) -> None:
+    """Write what `write_page` does."""
+    scene, data = encoded
     rows = (f"<div><dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd></div>" for k, v in (facts or {}).items())
     blocks = (f'<script type="application/octet-stream" id="{name}">{text}</script>' for name, text in data.items())
     parts = {
@@ -50,8 +72,8 @@ def write_page(
     Path(path).write_text(page, encoding="utf-8", newline="\n")
 
 
-def _scene(animations: dict[str, Animation]) -> tuple[dict[str, object], dict[str, str]]:
-    """Return what the page's script reads: the facts of the scene, and its blocks of data by name."""
+def _scene(animations: dict[str, Animation]) -> Encoded:
+    """Return what the page's script reads."""
     first = next(iter(animations.values()))
     frames, verts, _ = first.garment.shape
     tracks = [_track(each.garment) for each in animations.values()]
@@ -63,7 +85,7 @@ def _scene(animations: dict[str, Animation]) -> tuple[dict[str, object], dict[st
         record, data["track-body"] = _track(first.body.vertices)
         scene["body"] = {"verts": first.body.vertices.shape[1], "worn": first.body.worn, "tracks": [record]}
         data["body-faces"] = _faces(first.body.faces)
-    return scene, data
+    return Encoded(scene, data)
 
 
 def _checked(animations: Mapping[str, Animation]) -> dict[str, Animation]:
