@@ -67,14 +67,14 @@ def _evaluated(problem: Problem, x, held, at):
 
 
 def _sticking(problem: Problem, point):
-    """The stiffness (verts, 3, 3) of what holds vertices in contact along the body: m STICK^2 (I - n n^T)."""
+    """The stiffness (verts, 3, 3) of what holds touching vertices along the body, where no pins hold: m STICK^2 (I - n n^T)."""
     eye = jnp.eye(3, dtype=point.gradient.dtype)
-    if point.contact is None:
+    if point.contact is None or problem.terms.pinning:
         return jnp.zeros((len(point.gradient), 3, 3), eye.dtype)
     push = point.contact.gradient
     normal, touches = normalize(push), jnp.any(push != 0, axis=1)
     weight = jnp.where(touches, problem.mass * STICK**2, 0)
-    return weight[:, None, None] * (eye - normal[:, :, None] * normal[:, None, :])
+    return weight[:, None, None] * (eye[None] - normal[:, :, None] * normal[:, None, :])
 
 
 @jax.jit
@@ -107,9 +107,9 @@ def _solved(matrix, right):
 def _drape(problem: Problem, x, mass):
     """The stiffness K (3 verts, 3 verts) about the static equilibrium x_0 near x; warn where it is not reached.
 
-    Without friction a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium near,
-    and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as friction
-    holds it: by m STICK^2. Newton's method then converges. A mass over h^2 damps it, the less the farther it gets.
+    Without friction or pins a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium
+    near, and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as
+    friction holds it: see `_sticking`. Newton's method then converges. A mass over h^2 damps it, the less the farther it gets.
     """
     from scipy.sparse import diags
 
@@ -151,11 +151,11 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
 
         (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
 
-    K = d^2 E / dx^2 at x_0, as Newton's method has it, holds the tension of the cloth that hangs and what contact presses;
-    without them a garment would have no period of its own. s is `LEAST`'s. R are the blended rotations of skinning there: the
-    directions d_k (m) are those of unposed space. Each is scaled so that it costs the same energy, d^T K d = E_0, the softest
-    having a root mean square of `AMPLITUDE`. The softest vibrations of all would be those of single folds, which nothing
-    excites. Source: Wilson, Yuan and Dickens 1982.
+    K = d^2 E / dx^2 at x_0, as Newton's method has it, with what touches the body stuck to it (`_drape`). It holds the tension
+    of the cloth that hangs and what contact presses; without them a garment would have no period of its own. s is `LEAST`'s. R
+    are the blended rotations of skinning there: the directions d_k (m) are those of unposed space. Each is scaled so that it
+    costs the same energy, d^T K d = E_0, the softest having a root mean square of `AMPLITUDE`. The softest vibrations of all
+    would be those of single folds, which nothing excites. Source: Wilson, Yuan and Dickens 1982.
 
     Returns:
         None where the garment hangs on nothing: a vibration is slower than `LEAST`.
