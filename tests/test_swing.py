@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from ncs_jax import InputError, assemble, load_run, train
-from ncs_jax.energies.terms import StepInputs
+from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import total
 from ncs_jax.errors import InputWarning
 from ncs_jax.geometry.skinning import blend, skin
@@ -21,7 +22,7 @@ from ncs_jax.prepare.setting import with_cell
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
-from ncs_jax.simulation.ritz_modes import _slope, softest_ritz_modes
+from ncs_jax.simulation.ritz_modes import STICK, _slope, _sticking, softest_ritz_modes
 from ncs_jax.training.loss import gradients
 from ncs_jax.training.step import Task, initial_state, windows_of
 
@@ -68,6 +69,20 @@ def test_a_garment_that_comes_to_no_rest_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr("ncs_jax.simulation.ritz_modes.STEPS", 1)
     with pytest.warns(InputWarning, match="came to no rest"):
         softest_ritz_modes(*given)
+
+
+def test_what_touches_the_body_is_held_along_it():
+    """By m STICK^2 against any way along the surface, by nothing against the normal, nor where no contact pushes."""
+    push = jnp.asarray([[0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [1.0, -2.0, 2.0]])
+    contact = SimpleNamespace(contact=SimpleNamespace(gradient=push), gradient=push)
+    loose, pinned = (SimpleNamespace(mass=jnp.asarray([2.0, 2.0, 0.5]), terms=Terms(pinning=p)) for p in (False, True))
+    held = np.asarray(_sticking(loose, contact))
+    np.testing.assert_allclose(held[0], 2 * STICK**2 * np.diag([1.0, 1.0, 0.0]), atol=1e-9)
+    assert not held[1].any()
+    np.testing.assert_allclose(held[2] @ push[2], 0, atol=1e-9)
+    np.testing.assert_allclose(held[2] @ [2.0, 2.0, 1.0], 0.5 * STICK**2 * np.array([2.0, 2.0, 1.0]))
+    bare = SimpleNamespace(contact=None, gradient=push)
+    assert not _sticking(loose, bare).any() and not _sticking(pinned, contact).any()
 
 
 def test_vibrations_are_those_of_the_energy_about_the_drape(tmp_path):

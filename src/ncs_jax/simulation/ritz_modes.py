@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ncs_jax.energies.inertia import G, out_of_balance
 from ncs_jax.errors import InputWarning
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
+from ncs_jax.geometry.numerics import normalize
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
@@ -35,8 +35,10 @@ from ncs_jax.simulation.solver.stiffness import couplings_from
 __all__ = ["softest_ritz_modes"]
 
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
-STEPS = 200  # of Newton's method to the drape
-ENOUGH = {np.dtype(np.float32): 0.3, np.dtype(np.float64): 0.01}  # m/s^2: the acceleration that may be left there
+FALL = 5  # steps without friction, until the garment touches the body
+STEPS = 60  # of Newton's method to the drape, at most
+STILL = {np.dtype(np.float32): 1e-3, np.dtype(np.float64): 1e-5}  # m, r.m.s.: a Newton step this short ends the search
+STICK = 30.0  # rad/s: of a vertex that is held on the body: under its own weight it slips by g / STICK^2, 11 mm
 LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
@@ -51,11 +53,28 @@ def _still(model: Model, track: MotionFeatures) -> tuple[Problem, Array]:
 
 
 @jax.jit
-def _evaluated(problem: Problem, x):
-    """The problem that knows what is near, what is known of the place, and the blocks of its stiffness and a mass."""
+def _evaluated(problem: Problem, x, held, at):
+    """The problem that knows what is near, what is known of the place, and the blocks of its stiffness and a mass.
+
+    held (verts, 3, 3): the stiffness that holds the vertices `at` where they touched the body.
+    """
     problem = with_neighbours(problem, find_neighbours(problem, x))
     point = evaluate(problem, x)
-    return problem, point, stiffness_blocks(problem, x, point)
+    diagonal, off = stiffness_blocks(problem, x, point)
+    force = jnp.einsum("vij,vj->vi", held, x - at)
+    point = point._replace(value=point.value + jnp.sum(force * (x - at)) / 2, gradient=point.gradient + force)
+    return problem, point, (diagonal + held, off)
+
+
+def _sticking(problem: Problem, point):
+    """The stiffness (verts, 3, 3) of what holds touching vertices along the body, where no pins hold: m STICK^2 (I - n n^T)."""
+    eye = jnp.eye(3, dtype=point.gradient.dtype)
+    if point.contact is None or problem.terms.pinning:
+        return jnp.zeros((len(point.gradient), 3, 3), eye.dtype)
+    push = point.contact.gradient
+    normal, touches = normalize(push), jnp.any(push != 0, axis=1)
+    weight = jnp.where(touches, problem.mass * STICK**2, 0)
+    return weight[:, None, None] * (eye[None] - normal[:, :, None] * normal[:, None, :])
 
 
 @jax.jit
@@ -85,31 +104,42 @@ def _solved(matrix, right):
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
 
 
-def _drape(problem: Problem, x):
-    """The blocks at the static equilibrium x_0, found by Newton's method from x; warn where it is not reached.
+def _drape(problem: Problem, x, mass):
+    """The stiffness K (3 verts, 3 verts) about the static equilibrium x_0 near x; warn where it is not reached.
 
-    What `implicit_euler` does, on the host: that is slower a step, and has no factorisation of its own to compile. A loose
-    garment without friction slides down the body for hundreds of steps. Its frequencies change little there, its modes do.
+    Without friction or pins a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium
+    near, and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as
+    friction holds it: see `_sticking`. Newton's method then converges. A mass over h^2 damps it, the less the farther it gets.
     """
-    known = _evaluated(problem, x)
-    for _ in range(STEPS):
-        near, point, found = known
-        diagonal, off = (np.asarray(block, np.float64) for block in found)
-        if G * out_of_balance(point.gradient, near.mass) < ENOUGH[x.dtype]:
-            return diagonal, off
-        p = _solved(_matrix(problem, diagonal, off), -np.asarray(point.gradient, np.float64).ravel())
-        p = jnp.asarray(p.reshape(x.shape), x.dtype)
-        t = float(_longest(point, p))
-        while not _accepted(point, (known := _evaluated(problem, x + t * p))[1], t, p):
+    from scipy.sparse import diags
+
+    least = float(static_step(problem.model))
+    added = mass / max(1 / problem.model.fps, least) ** 2  # by `blocks`
+    held, at, h = jnp.zeros((*x.shape, 3), x.dtype), x, least
+    known = _evaluated(problem, x, held, at)
+    for count in range(STEPS):
+        if count == FALL:
+            held, at = _sticking(problem, known[1]), x
+            known = _evaluated(problem, x, held, at)
+        _, point, found = known
+        stiff = _matrix(problem, *(np.asarray(block, np.float64) for block in found)) - diags(np.repeat(added, 3))
+        p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
+        if count > FALL and np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum()) < STILL[x.dtype]:
+            return stiff
+        p = jnp.asarray(p, x.dtype)
+        longest = t = float(_longest(point, p))
+        while not _accepted(point, (known := _evaluated(problem, x + t * p, held, at))[1], t, p):
             t /= 2
             if t < LEAST_STEP:
                 break
         if t < LEAST_STEP:
             break
         x = x + t * p
+        if count >= FALL:
+            h = min(2 * h, 1 / (2 * np.pi * LEAST)) if t > 0.5 else h if t > 0.25 * longest else max(h / 2, least)
     told = "the garment came to no rest on the body, so the periods that its swing is made of are rough"
     warnings.warn(f"{told}; if it swings too fast or too slowly, choose another network.cell", InputWarning, stacklevel=2)
-    return diagonal, off
+    return stiff
 
 
 def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
@@ -121,11 +151,11 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
 
         (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
 
-    K = d^2 E / dx^2 at x_0, as Newton's method has it, holds the tension of the cloth that hangs and what contact presses;
-    without them a garment would have no period of its own. s is `LEAST`'s. R are the blended rotations of skinning there: the
-    directions d_k (m) are those of unposed space. Each is scaled so that it costs the same energy, d^T K d = E_0, the softest
-    having a root mean square of `AMPLITUDE`. The softest vibrations of all would be those of single folds, which nothing
-    excites. Source: Wilson, Yuan and Dickens 1982.
+    K = d^2 E / dx^2 at x_0, as Newton's method has it, with what touches the body stuck to it (`_drape`). It holds the tension
+    of the cloth that hangs and what contact presses; without them a garment would have no period of its own. s is `LEAST`'s. R
+    are the blended rotations of skinning there: the directions d_k (m) are those of unposed space. Each is scaled so that it
+    costs the same energy, d^T K d = E_0, the softest having a root mean square of `AMPLITUDE`. The softest vibrations of all
+    would be those of single folds, which nothing excites. Source: Wilson, Yuan and Dickens 1982.
 
     Returns:
         None where the garment hangs on nothing: a vibration is slower than `LEAST`.
@@ -141,12 +171,10 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     smooth = modal_basis(rest, np.asarray(mesh.faces), area, -(-count // 3), held=held)
     if not smooth.size:
         return None
-    added = mass / max(1 / model.fps, float(static_step(model))) ** 2  # by `blocks`
     masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
-    diagonal, off = _drape(problem, skin(transforms, mesh.rest))
-    stiff = _matrix(problem, diagonal, off) - diags(np.repeat(added, 3))
+    stiff = _drape(problem, skin(transforms, mesh.rest), mass)
     u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
     squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
     if squares[0] < least:
