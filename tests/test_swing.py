@@ -13,7 +13,6 @@ import pytest
 from ncs_jax import InputError, assemble, load_run, train
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import total
-from ncs_jax.errors import InputWarning
 from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.network.methods.swing import QUIET, Swing
 from ncs_jax.network.rollout import stepper
@@ -62,13 +61,12 @@ def test_a_hanging_strip_swings_as_a_chain_does(tmp_path):
     np.testing.assert_allclose(frequency, 2.404826 / 2 * np.sqrt(9.81 / np.ptp(model.garment.mesh.rest[:, 1])), rtol=0.01)
 
 
-def test_a_garment_that_comes_to_no_rest_is_told(tmp_path, monkeypatch):
+def test_a_garment_that_comes_to_no_rest_has_no_vibrations(tmp_path, monkeypatch):
     assembly = hanging(tmp_path, 8)
     given = assembly.model, assembly.track, 3
-    assert softest_ritz_modes(*given) is not None  # which is silent: warnings are errors
+    assert softest_ritz_modes(*given) is not None
     monkeypatch.setattr("ncs_jax.simulation.ritz_modes.STEPS", 1)
-    with pytest.warns(InputWarning, match="came to no rest"):
-        softest_ritz_modes(*given)
+    assert softest_ritz_modes(*given) is None
 
 
 def test_what_touches_the_body_is_held_along_it():

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 from ncs_jax.cli import arguments
 from ncs_jax.cli.preview import draw
@@ -118,7 +119,8 @@ class _TrainingBar:
 
         self._progress = WorkProgress("reading the scene and compiling", quiet=jax.process_index() > 0)
         self._devices = jax.device_count()
-        self._handler, self._stopped = None, False
+        self._handler: Any = None
+        self._stopped = False
         self.reports = 0
 
     def __enter__(self) -> _TrainingBar:

@@ -81,7 +81,7 @@ def build(
         faces = touchable_faces(model, body, prepared.part)
         model = replace(model, surface=surface_of(model, faces, track, scene.physics.collision.distance == "smooth"))
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
-        if not prepared.vibrations.size:
+        if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
             prepared = _with_vibrations(scene, prepared, model, faces, known, report or _tell_a_person)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)

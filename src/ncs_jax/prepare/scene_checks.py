@@ -42,7 +42,7 @@ DEEP = 0.01  # m that vertices may be inside the body, where the body alone carr
 MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
-CLEAR = 0.02  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
+CLEAR = 0.005  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def cell_of(scene: Scene, hangs: bool, automatic: bool) -> Scene:
     if not automatic:
         raise InputError(
             "a garment that hangs on something, and swings, expected", file=scene.source, field="network.cell", value="swing",
-            mend="pin it, put it on a body, or choose the gated or the linear cell",
+            mend="it comes to no rest: pin it, put it on a body, or choose the gated or the linear cell",
         )  # fmt: skip
     return replace(scene, network=replace(network, cell="gated"))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import jax
@@ -10,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ncs_jax.errors import InputWarning
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.numerics import normalize
@@ -105,7 +103,7 @@ def _solved(matrix, right):
 
 
 def _drape(problem: Problem, x, mass):
-    """The stiffness K (3 verts, 3 verts) about the static equilibrium x_0 near x; warn where it is not reached.
+    """The stiffness K (3 verts, 3 verts) about the static equilibrium x_0 near x; None where the garment comes to no rest.
 
     Without friction or pins a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium
     near, and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as
@@ -124,7 +122,8 @@ def _drape(problem: Problem, x, mass):
         _, point, found = known
         stiff = _matrix(problem, *(np.asarray(block, np.float64) for block in found)) - diags(np.repeat(added, 3))
         p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
-        if count > FALL and np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum()) < STILL[x.dtype]:
+        step = np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum())
+        if count > FALL and step < STILL[x.dtype]:
             return stiff
         p = jnp.asarray(p, x.dtype)
         longest = t = float(_longest(point, p))
@@ -132,14 +131,12 @@ def _drape(problem: Problem, x, mass):
             t /= 2
             if t < LEAST_STEP:
                 break
-        if t < LEAST_STEP:
-            break
+        if t < LEAST_STEP:  # as near as rounding lets it come, or lost
+            return stiff if count > FALL and step < 10 * STILL[x.dtype] else None
         x = x + t * p
         if count >= FALL:
             h = min(2 * h, 1 / (2 * np.pi * LEAST)) if t > 0.5 else h if t > 0.25 * longest else max(h / 2, least)
-    told = "the garment came to no rest on the body, so the periods that its swing is made of are rough"
-    warnings.warn(f"{told}; if it swings too fast or too slowly, choose another network.cell", InputWarning, stacklevel=2)
-    return stiff
+    return None
 
 
 def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
@@ -158,7 +155,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     would be those of single folds, which nothing excites. Source: Wilson, Yuan and Dickens 1982.
 
     Returns:
-        None where the garment hangs on nothing: a vibration is slower than `LEAST`.
+        None where the garment hangs on nothing: it comes to no rest, or a vibration is slower than `LEAST`.
     """
     from scipy.linalg import eigh
     from scipy.sparse import diags
@@ -175,6 +172,8 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
     stiff = _drape(problem, skin(transforms, mesh.rest), mass)
+    if stiff is None:
+        return None
     u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
     squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
     if squares[0] < least:
