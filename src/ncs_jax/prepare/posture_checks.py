@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.prepare.joint_names import Limbs, anatomy
-from ncs_jax.prepare.retarget import body_names, sole_heights
+from ncs_jax.prepare.retarget import body_names, called, sole_heights
 from ncs_jax.prepare.skeleton import body_axes, forward, sampled, top
 
 __all__ = ["posture_faults"]
@@ -58,7 +58,7 @@ def posture_faults(record: MotionRecord, body: BodyRecord, world: str) -> Iterat
     names = body_names(body)
     if not names:
         return
-    of, few = anatomy(names, body.parents.tolist(), body.joints), sampled(record)
+    of, few = anatomy(called(names, body.bones), body.parents.tolist(), body.joints), sampled(record)
     if "head" not in of.roles or not of.spine:
         return
     told = replace(few, joints=body.joints, parents=body.parents, rest_rotations=body.rest_rotations, joint_names=names)

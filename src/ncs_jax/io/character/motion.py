@@ -1,4 +1,4 @@
-"""Motions from .npz and .h5 (this package's, and AMASS's), from .bvh, and from animated characters in .glb, .gltf and .fbx."""
+"""Motions from .npz and .h5 (this package's, and AMASS's), from .bvh, and from animations in .glb, .gltf, .vrma and .fbx."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ READERS: dict[str, Callable[[str, str], MotionRecord]] = {
     ".glb": gltf_motion,
     ".gltf": gltf_motion,
     ".vrm": gltf_motion,
+    ".vrma": gltf_motion,
     ".fbx": fbx_motion,
 }
 FORMATS = (*TABLES, *READERS)
