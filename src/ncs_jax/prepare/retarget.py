@@ -228,7 +228,7 @@ def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[st
 
 def _shown(motion: MotionRecord, places: np.ndarray) -> SkeletonPoses:
     """Return a motion's own skeleton, with joints at places (T, J, 3), in the frames that pictures show."""
-    return SkeletonPoses(places[shown_frames(len(places))], rest_of(motion)[1], motion.joint_names)
+    return SkeletonPoses(places[shown_frames(len(places))], rest_of(motion)[1], called(motion.joint_names, motion.bones))
 
 
 def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int], quarter, axes) -> np.ndarray:
