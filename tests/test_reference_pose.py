@@ -229,7 +229,7 @@ def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degree
 
 def turned_alone(motion: MotionRecord, part: str, side: str, turn: Rotation) -> MotionRecord:
     """The motion since a zero pose in which one joint alone is turned."""
-    turns = np.broadcast_to(np.eye(3), (len(motion.parents), 3, 3)).copy()
+    turns = np.broadcast_to(np.eye(3), (motion.poses.shape[1], 3, 3)).copy()
     turns[[key == (side, part) for key in figure("mixamo")[3]]] = turn.as_matrix()
     return told_since(motion, turns)
 

@@ -121,8 +121,8 @@ def is_person(places: np.ndarray, of: Limbs) -> bool:
             return False
         if foot is not None and (_angle(foot, up) < 35 or _angle(foot, -ahead) < 35):
             return False
-    across = [_between(places, of, f"right {part}", f"left {part}") for part in ("thigh", "arm")]
-    return any(a is None for a in across) or _angle(*across) < 50
+    hips, shoulders = (_between(places, of, f"right {part}", f"left {part}") for part in ("thigh", "arm"))
+    return hips is None or shoulders is None or _angle(hips, shoulders) < 50
 
 
 def is_even(places: np.ndarray, of: Limbs) -> bool:
