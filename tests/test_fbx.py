@@ -415,3 +415,59 @@ def test_meshes_blend_shapes_and_garments(tmp_path, writer):
         io.read_body(path, shapes={"wide": 1.0})
     with pytest.raises(InputError, match=r"body\.part: no such mesh.*'Skirt'.*Skin \("):  # it has no skin
         io.read_body(path, part=["Skirt"])
+
+
+def retimed(tree: list, fps: float, flags: int = 4, start: float = 0.0, **settings) -> list:
+    """A tree with other GlobalSettings and all its keys at another rate."""
+
+    def change(node):
+        name, values, inner = node
+        if name == "KeyTime":
+            return (name, [np.array(np.round((start + np.arange(FRAMES) / fps) * 46186158000), np.int64)], inner)
+        if name == "KeyAttrFlags":
+            return (name, [np.array([flags], np.int32)], inner)
+        if name == "GlobalSettings":
+            return (name, values, [fbx.properties(**settings)])
+        return (name, values, None if inner is None else [change(n) for n in inner])
+
+    return [change(node) for node in tree]
+
+
+@pytest.mark.parametrize(
+    ("settings", "fps"),
+    [
+        ({"TimeMode": 0}, 60),
+        ({}, 24),
+        ({"TimeMode": 12}, 50),
+        ({"TimeMode": 14, "CustomFrameRate": -1.0}, 120),
+        ({"TimeMode": 3}, 60),
+    ],
+)
+def test_the_rate_is_the_keys_where_the_file_states_none(tmp_path, settings, fps):
+    """TimeMode 0 is the program's default, 12 a thousand a second, 14 another one, -1 none."""
+    hero = Hero("Y up, cm")
+    (tmp_path / "hero.fbx").write_bytes(fbx.binary(retimed(hero.tree(), fps, **settings)))
+    motion = io.read_motion(tmp_path / "hero.fbx")
+    assert motion.fps == fps and len(motion.poses) == FRAMES
+    (tmp_path / "plain.fbx").write_bytes(fbx.binary(hero.tree()))
+    np.testing.assert_allclose(motion.poses, io.read_motion(tmp_path / "plain.fbx").poses, atol=1e-6)
+
+
+@pytest.mark.parametrize("flags", [2, 2 | 0x100])
+def test_held_keys_are_met_at_rates_that_are_no_whole_numbers(tmp_path, flags):
+    hero = Hero("Y up, cm")
+    ntsc = retimed(hero.tree(), 30 / 1.001, flags, start=7.0, TimeMode=9)
+    (tmp_path / "hero.fbx").write_bytes(fbx.binary(ntsc))
+    (tmp_path / "plain.fbx").write_bytes(fbx.binary(hero.tree()))
+    held, plain = (io.read_motion(tmp_path / f"{name}.fbx") for name in ("hero", "plain"))
+    np.testing.assert_allclose(held.poses, plain.poses, atol=1e-6)
+
+
+def test_a_text_with_a_byte_order_mark_and_a_camera_that_turns(tmp_path):
+    tree = Hero("Y up, cm").tree(skin=False)
+    objects, links = tree[2][2], tree[3][2]
+    objects += [("Model", [900, "Model::Camera", "Camera"], [fbx.properties(Lcl__Rotation=(0, 0, 0))]),
+                ("AnimationCurveNode", [901, "AnimCurveNode::R", ""], []), fbx.curve(902, [0, 1], [0, 90])]  # fmt: skip
+    links += [fbx.link(900, 0), fbx.link(901, 51), fbx.link(901, 900, "Lcl Rotation"), fbx.link(902, 901, "d|Y")]
+    (tmp_path / "hero.fbx").write_bytes(b"\xef\xbb\xbf" + fbx.text(tree))
+    assert io.read_motion(tmp_path / "hero.fbx").joint_names == NAMES

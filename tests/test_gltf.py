@@ -17,6 +17,7 @@ from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
 from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.retarget import paired
 from ncs_jax.scene.spec import scene_from
 from ncs_jax.view.live import view
 from tests import fbx_files
@@ -30,7 +31,7 @@ def agree(path: Path, clip: str = "", number: int = 0) -> tuple[io.BodyRecord, i
     body, motion = io.read_body(path), io.read_motion(f"{path}#{clip}" if clip else path)
     assert body.joint_names == motion.joint_names
     ours = posed(body, motion)
-    theirs = skinned(path, np.arange(len(motion.poses)) / motion.fps, number)
+    theirs = skinned(path, (np.arange(len(motion.poses)) / motion.fps).astype(np.float32), number)  # as keys are
     _, same = cKDTree(ours[0]).query(theirs[0])  # vertices that were split are one here
     assert len(np.unique(same)) == len(body.vertices)
     assert np.abs(ours[:, same] - theirs).max() < 1e-5
@@ -96,6 +97,29 @@ def test_names_choose_an_animation_and_the_first_is_taken_without(tmp_path):
     np.testing.assert_array_equal(io.read_motion(empty).poses, io.read_motion(f"{path}#still").poses)
     with pytest.raises(InputError, match=r"hero\.glb: animations: no such animation .found 'run'.; .*walk, still"):
         io.read_motion(f"{path}#run")
+
+
+@pytest.mark.parametrize("mode", ["LINEAR", "CUBICSPLINE"])
+def test_a_clip_that_stands_still_is_not_taken_for_one_that_moves(tmp_path, mode):
+    """Keys that alternate between a quaternion and its negative turn nothing, nor do the slopes of cubic keys move."""
+    path = write_glb(tmp_path / "hero.glb", mode=mode)
+    swapped = changed(path, tmp_path / "swapped.gltf", lambda tree: tree["animations"].reverse())
+    np.testing.assert_array_equal(io.read_motion(swapped).poses, io.read_motion(f"{path}#walk").poses)
+
+
+def test_what_turns_beside_the_skeleton_is_not_taken_for_it(tmp_path):
+    path = write_glb(tmp_path / "hero.glb")
+
+    def camera(tree: dict) -> None:
+        tree["skins"], tree["meshes"] = [], []
+        del tree["nodes"][4]["skin"], tree["nodes"][4]["mesh"]
+        tree["nodes"].append({"name": "Camera"})
+        tree["scenes"][0]["nodes"].append(5)
+        tree["animations"][0]["channels"].append({"sampler": 0, "target": {"node": 5, "path": "rotation"}})
+
+    found = io.read_motion(changed(path, tmp_path / "scene.gltf", camera))
+    assert found.joint_names == NAMES
+    assert np.abs(found.poses).max() > 0.1
 
 
 @pytest.mark.parametrize(
@@ -332,3 +356,32 @@ def posed_in_float32(path: Path, frames: int) -> np.ndarray:
     motion = load_motion(scene_from({"body": {"file": str(path)}, "motion": {"files": []}}), str(path), io.read_body(path))
     assert len(motion.poses) == frames
     return posed(io.read_body(path), motion)
+
+
+HUMANOID = {"hips": 1, "spine": 2, "head": 3}
+EXTENSIONS = {
+    "VRM 0": ("hero.vrm", "VRM", [{"bone": b, "node": n} for b, n in HUMANOID.items()] + [{"bone": "jaw", "node": -1}]),
+    "VRM 1": ("hero.vrm", "VRMC_vrm", {b: {"node": n} for b, n in HUMANOID.items()}),
+    "an animation": ("hero.vrma", "VRMC_vrm_animation", {b: {"node": n} for b, n in HUMANOID.items()}),
+    "a draft of one": ("hero.vrma", "VRMC_vrm_animation", HUMANOID),
+}
+
+
+@pytest.mark.parametrize("case", EXTENSIONS)
+def test_the_bones_of_a_vrm_are_those_it_says_whatever_its_nodes_are_called(tmp_path, case):
+    name, extension, bones = EXTENSIONS[case]
+    path = write_glb(tmp_path / "hero.glb")
+    plain, gltf = io.read_motion(path), gl.GLTF2().load(str(path))
+    gltf.extensions = {extension: {"humanoid": {"humanBones": bones}}}
+    for j in range(3):
+        gltf.nodes[j + 1].name = f"Bone.{7 - j:03d}"
+    gltf.save(str(tmp_path / "named.glb"))
+    path = (tmp_path / "named.glb").rename(tmp_path / name)
+    motion = io.read_motion(f"{path}#walk")
+    assert motion.bones == tuple(HUMANOID) and motion.joint_names == ("Bone.007", "Bone.006", "Bone.005")
+    np.testing.assert_array_equal(motion.poses, plain.poses)
+    if name.endswith(".vrm"):
+        body = io.read_body(path)
+        assert body.bones == motion.bones and io.read_body(tmp_path / "hero.glb").bones == ()
+        source, target, pairs = paired(motion, body, {})
+        assert pairs == {0: 0, 1: 1, 2: 2} and source.roles["head"] == target.roles["head"] == 2

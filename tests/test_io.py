@@ -555,7 +555,7 @@ DAMAGED = {
     "not_hdf5.h5": (b"poses", "not a readable HDF5"),
     "truncated.h5": (b"\x89HDF\r\n\x1a\n" + b"\0" * 100, "not a readable HDF5"),
     "empty.h5": (b"", "an empty file"),
-    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh, .glb, .gltf, .vrm, .fbx expected"),
+    "m.xyz": (b"1", "one of .npz, .h5, .hdf5, .bvh, .glb, .gltf, .vrm, .vrma, .fbx expected"),
     "m": (b"1", "found 'no suffix'"),
     "words.bvh": (b"hello", "HIERARCHY and then MOTION"),
     "binary.bvh": (bytes(range(256)) * 4, "HIERARCHY and then MOTION"),

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
+from ncs_jax.io.character.smpl import smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.scene.spec import scene_from
@@ -340,3 +341,42 @@ def test_frames_that_a_file_lacks_are_named():
         load_motion(one, one.motions[0], io.read_body(packaged("body")))
     with pytest.raises(InputError, match=r"motion: frames as \[START:STOP\]"):
         load_motion(one, "ncs:walk[1-2:]", io.read_body(packaged("body")))
+
+
+def swung(rng, joints: int = 24) -> np.ndarray:
+    return 0.4 * np.sin(np.linspace(0, 5, 30)[:, None, None] + rng.uniform(0, 6, (1, joints, 3)))
+
+
+def test_tables_of_other_contents_say_what_to_write(tmp_path, rng):
+    """Degrees, places of joints, other orders and other names: none is read as something else."""
+    poses = swung(rng)
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3))
+    matrices = turns.as_matrix().reshape(30, 24, 3, 3)
+    places = np.zeros((30, 24, 3))
+    for j, parent in enumerate(smpl_parents(24)[1:], 1):  # bones of 1 to 3 dm
+        places[:, j] = places[:, parent] + matrices[:, parent] @ rng.uniform(0.1, 0.3, 3)
+    rest = {"trans": np.zeros((30, 3)), "fps": 30}
+    cases = [
+        ({"poses": np.degrees(poses), **rest}, "poses: axis times angle in radians expected .*divide by 57.29578"),
+        ({"poses": places, **rest}, "poses: rotations expected, not the places of joints .*fit SMPL"),
+        ({"poses": matrices[..., :2], **rest}, "poses: .*of a 6D rotation make a matrix"),
+        ({"poses": matrices[..., :2].reshape(30, 24, 6), **rest}, "poses: .*of a 6D rotation make a matrix"),
+        ({"quaternions": turns.as_quat().reshape(30, 24, 4), **rest}, r"quaternions: w first expected .*\[3, 0, 1, 2\]"),
+        (
+            {"smpl_poses": poses.reshape(30, 72), "smpl_trans": rest["trans"], "smpl_scaling": [93.0]},
+            "smpl_trans / smpl_scaling",
+        ),
+        ({"global_orient": poses[:, 0], "body_pose": poses[:, 1:].reshape(30, -1)}, "body_pose: .*trans = transl and fps"),
+        ({"joints": places, "fps": 20}, "joints: poses or quaternions expected .*fit SMPL"),
+    ]
+    for arrays, words in cases:
+        np.savez(tmp_path / "m.npz", **arrays)
+        with pytest.raises(InputError, match=words):
+            io.read_motion(tmp_path / "m.npz")
+    np.savez(tmp_path / "m.npz", quaternions=turns.as_quat(scalar_first=True).reshape(30, 24, 4), **rest)
+    np.testing.assert_allclose(io.read_motion(tmp_path / "m.npz").poses, poses, atol=1e-9)
+    np.savez(tmp_path / "m.npz", poses=poses, **rest)
+    np.testing.assert_array_equal(io.read_motion(tmp_path / "m.npz").poses, poses)
+    (tmp_path / "dance.pkl").write_bytes(b"\x80\x04.")
+    with pytest.raises(InputError, match=r"dance\.pkl: one of .*write an \.npz of poses, trans and fps"):
+        io.read_motion(tmp_path / "dance.pkl")

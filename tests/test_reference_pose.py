@@ -227,6 +227,51 @@ def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degree
         assert told and all(words in fault[0] and "motion.rest" in fault[3] for fault in told)
 
 
+def turned_alone(motion: MotionRecord, part: str, side: str, turn: Rotation) -> MotionRecord:
+    """The motion since a zero pose in which one joint alone is turned."""
+    turns = np.broadcast_to(np.eye(3), (motion.poses.shape[1], 3, 3)).copy()
+    turns[[key == (side, part) for key in figure("mixamo")[3]]] = turn.as_matrix()
+    return told_since(motion, turns)
+
+
+@pytest.mark.parametrize("axis", "xyz")
+@pytest.mark.parametrize("degrees", [-90, 90, 180])
+def test_hips_alone_that_are_turned_are_mended_or_told(body, axis, degrees):
+    motion = walk()
+    given = turned_alone(motion, "hips", "", Rotation.from_euler(axis, degrees, degrees=True))
+    found = driven(given, body)
+    off = apart(driven(motion, body), found)[0].max()
+    told = [what for what, *_ in posture_faults(found[2], body, "y")]
+    assert off < 0.5 or told == ["the spine bends too far"]
+    assert (axis, degrees) == ("x", 90) or off < 0.5
+
+
+@pytest.mark.parametrize("axis", "yz")
+def test_hips_that_stand_across_the_shoulders_are_no_zero_pose(body, axis):
+    motion = walk()
+    given = turned_alone(motion, "hips", "", Rotation.from_euler(axis, 60, degrees=True))
+    assert apart(driven(motion, body), driven(given, body))[0].max() < 0.5
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_foot_alone_that_is_no_persons_is_told(body, side):
+    motion = walk()
+    given = turned_alone(motion, "foot", side, Rotation.from_euler("z", 90, degrees=True))
+    told = list(posture_faults(driven(given, body)[2], body, "y"))
+    assert [fault[0] for fault in told] == [f"the {side} foot is tipped"] and "motion.rest" in told[0][3]
+
+
+def test_a_t_pose_at_the_end_is_found_too(body):
+    motion, at_rest = walk(), np.zeros((4, len(walk().parents), 3))
+    steps = replace(
+        motion, poses=np.concatenate([motion.poses, at_rest]), translation=np.pad(motion.translation, ((0, 4), (0, 0)))
+    )
+    found = driven(told_since(steps, along(motion, 0)), body)
+    assert any("a T-pose at the end" in note for note in found[2].notes)
+    angles, far = apart(driven(steps, body), found)
+    assert angles.max() < 0.1 and far < 1e-3
+
+
 def bvh_text(motion: MotionRecord, positions: dict[str, np.ndarray], hips: np.ndarray | None = None) -> str:
     """A .bvh in which some joints have position channels (T, 3); with `hips` a still or moving root (T, 3) stands above."""
     joints, parents, names = np.asarray(motion.joints), np.asarray(motion.parents), motion.joint_names

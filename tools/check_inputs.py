@@ -42,7 +42,7 @@ KINDS: dict[str, Callable] = {"body": io.read_body, "garment": io.read_garment, 
 SUFFIXES = {
     "body": {".npz", ".glb", ".gltf", ".vrm", ".fbx", ".obj"},
     "garment": {".obj", ".ply", ".stl", ".usd", ".usda", ".usdc", ".usdz"},
-    "motion": {".npz", ".h5", ".hdf5", ".bvh", ".glb", ".gltf", ".fbx"},
+    "motion": {".npz", ".h5", ".hdf5", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx"},
 }
 
 

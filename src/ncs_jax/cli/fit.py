@@ -217,10 +217,10 @@ def _scene(options, out: Path, found, body) -> str:
     """Return a whole scene for the fitted garment: with the packaged motions where the body's joints can be told apart."""
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.joint_names import anatomy
-    from ncs_jax.prepare.retarget import body_names
+    from ncs_jax.prepare.retarget import body_names, called
 
     names = body_names(body)
-    moved = names and anatomy(names, body.parents).roles.keys() >= LIMBS
+    moved = names and anatomy(called(names, body.bones), body.parents).roles.keys() >= LIMBS
     lines = [arguments.body_table(options, out.parent), "", "[garment]", f"file = {json.dumps(out.name)}"]
     lines += [f'pins = "{PINS}"'] if PINS in found.garment.groups else []
     lines += ["", "[motion]"]

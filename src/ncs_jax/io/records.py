@@ -25,8 +25,9 @@ class BodyRecord:
         parents: (J,) int32 with parents[j] < j, and -1 for joint 0, the root. weights: (V, J) skinning weights, not negative;
             every row sums to 1. joint_names: J names, or none. rest_rotations: (J, 3, 3) rotations of the joints in the rest
             pose, or None for the identity. posedirs: (V, 3, 9 (J - 1)) pose correctives of SMPL, m: what the entries of
-            R_j - I of every joint but the root add to the vertices, before skinning; None: no correctives. notes: what was
-            mended in the file.
+            R_j - I of every joint but the root add to the vertices, before skinning; None: no correctives. bones: J names of
+            a person's bones, "" for none, where the format says which joints they are; else none. notes: what was mended in
+            the file.
     """
 
     vertices: np.ndarray
@@ -37,6 +38,7 @@ class BodyRecord:
     joint_names: tuple[str, ...] = ()
     rest_rotations: np.ndarray | None = None
     posedirs: np.ndarray | None = None
+    bones: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -90,6 +92,7 @@ class MotionRecord:
         rest_rotations: (J, 3, 3) as in a body: the axes that the poses are along; None: the world's. up: the axis of the world
             that points up, where the format says so, else "". notes: what was done so that the motion drives the body.
         source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
+        bones: as in a body.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
     """
 
@@ -104,6 +107,7 @@ class MotionRecord:
     up: str = ""
     notes: tuple[str, ...] = ()
     source: SkeletonPoses | None = None
+    bones: tuple[str, ...] = ()
     undriven: dict[str, str] = field(default_factory=dict)
 
 

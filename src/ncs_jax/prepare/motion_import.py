@@ -26,7 +26,7 @@ Reader = Callable[[int, int | None], MotionRecord]
 
 __all__ = ["lead_in_frames", "load_motion", "retarget_to_body"]
 
-LOOK = 10  # first frames of a file among which a T-pose is looked for
+LOOK = 10  # first frames of a file, and last, among which a T-pose is looked for
 JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
 
 
@@ -112,11 +112,12 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
         start = spec.frames[0] if spec.frames else 0
         try:
             first = read(0, min(start, LOOK)) if start > 0 else _frames(motion, 0, LOOK) if spec.frames else read(0, LOOK)
+            last = read(-LOOK, None)
         except InputError:  # frames that the scene leaves out may be broken
-            first = _frames(motion, 0, LOOK)
+            first, last = _frames(motion, 0, LOOK), _frames(motion, -LOOK)
         why = "a moment of a movement, with left and right unlike" if person else "no person"
         try:
-            found = find_reference(motion, of, up, first)
+            found = find_reference(motion, of, up, first, last)
             found = replace(found, note=f"{found.note}; the zero pose is {why}")
         except InputError:
             if person:

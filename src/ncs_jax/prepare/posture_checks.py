@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.prepare.joint_names import Limbs, anatomy
-from ncs_jax.prepare.retarget import body_names, sole_heights
+from ncs_jax.prepare.retarget import body_names, called, sole_heights
 from ncs_jax.prepare.skeleton import body_axes, forward, sampled, top
 
 __all__ = ["posture_faults"]
@@ -27,7 +27,8 @@ TRUNK = 0.6, 0.35  # half the width and half the depth of the trunk, of half the
 # Degrees by which a joint has turned since rest, as seen from another, that nobody holds: chest (54), head (34), collar (19).
 SPINE, COLLAR = 75.0, 27.0
 SIDES = "left", "right"
-TIPPED = 20.0  # degrees by which both feet are tipped in frames in which they are low and slow (7; a dancer's one foot, 56)
+# Degrees by which both feet are tipped in frames in which they are low and slow (7), and one of them (a dancer's, 56).
+TIPPED, ALONE = 20.0, 59.0
 KNEE = 30.0  # degrees by which a shin points ahead of its thigh (0)
 
 
@@ -58,7 +59,7 @@ def posture_faults(record: MotionRecord, body: BodyRecord, world: str) -> Iterat
     names = body_names(body)
     if not names:
         return
-    of, few = anatomy(names, body.parents.tolist(), body.joints), sampled(record)
+    of, few = anatomy(called(names, body.bones), body.parents.tolist(), body.joints), sampled(record)
     if "head" not in of.roles or not of.spine:
         return
     told = replace(few, joints=body.joints, parents=body.parents, rest_rotations=body.rest_rotations, joint_names=names)
@@ -140,8 +141,8 @@ def _bends(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _tipped(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
-    """Yield a fault where both feet, when they should be flat on the ground, are not as at rest."""
-    feet, least = [f.of.roles.get(f"{side} foot") for side in SIDES], 180.0
+    """Yield a fault where feet, when they should be flat on the ground, are not as at rest."""
+    feet, tilts = [f.of.roles.get(f"{side} foot") for side in SIDES], list[float]()
     if None in feet or len(f.places) < 2:
         return
     for foot in feet:
@@ -149,7 +150,9 @@ def _tipped(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
         low = height <= np.percentile(height, 33)
         upward = f.turns[low & (speed <= np.percentile(speed[low], 50)), foot] @ f.axes[:, 1]
         tilt = np.degrees(np.arctan2(np.linalg.norm(np.cross(upward, f.up), axis=1), upward @ f.up))
-        least = min(least, float(np.percentile(tilt, 100 - MOST)))
-    if least > TIPPED:
-        value = f"by more than {least:.0f} degrees, where they are low and slow"
-        yield "both feet are tipped", value, "the zero pose was not understood", "motion.rest, or motion.joints"
+        tilts.append(float(np.percentile(tilt, 100 - MOST)))
+    if min(tilts) > TIPPED or max(tilts) > ALONE:
+        both = min(tilts) > TIPPED
+        value = f"by more than {min(tilts) if both else max(tilts):.0f} degrees, where low and slow"
+        which = "both feet are" if both else f"the {SIDES[int(np.argmax(tilts))]} foot is"
+        yield f"{which} tipped", value, "the zero pose was not understood", "motion.rest, or motion.joints"

@@ -51,19 +51,20 @@ class Reference:
     root: np.ndarray | None = None
 
 
-def find_reference(motion: MotionRecord, of: Limbs, up: str, first: MotionRecord) -> Reference:
+def find_reference(motion: MotionRecord, of: Limbs, up: str, first: MotionRecord, last: MotionRecord) -> Reference:
     """Return a pose in which a motion's skeleton is a person, where the zero pose is none.
 
     It is a T-pose or an A-pose among the first frames, or one of hanging arms where left and right are alike to 2 degrees; else
-    it is built, see `_built`.
+    a T-pose among the last; else it is built, see `_built`.
 
     Args:
-        motion: with a skeleton. of: its limbs. up: axis of the motion's world that points up. first: the file's first frames.
+        motion: with a skeleton. of: its limbs. up: axis of the motion's world that points up. first, last: the
+            file's first and last frames.
 
     Raises:
         InputError: no frame is such a pose, nor are there upright ones to build it from.
     """
-    found = _among(first, of, up) or _built(motion, of, up)
+    found = _among(first, of, up) or _at_end(last, of, up) or _built(motion, of, up)
     if found is None:
         raise InputError(
             "a skeleton whose zero pose is a person, or upright frames to find one from, expected", field="motion.rest",
@@ -94,7 +95,8 @@ def is_person(places: np.ndarray, of: Limbs) -> bool:
     """Tell whether joints (J, 3) are where some person's may be who stands, walks, climbs or crouches: by directions alone.
 
     No bone of the trunk leans by more than 65 degrees from hips to head. From hip to ankle it goes down, to 75 degrees. Left is
-    left at hips and shoulders, to 45. Arms do not go straight up, nor do toes point up or back. What is not there is not asked.
+    left at hips and shoulders, to 45, and to 50 between these. Arms do not go straight up, nor do toes point up or back. What
+    is not there is not asked.
     """
     up, left = places[top(of)] - places[of.roles["hips"]], side_vector(places, of)
     if not (np.linalg.norm(up) > 0 and np.linalg.norm(left) > 0):
@@ -119,7 +121,8 @@ def is_person(places: np.ndarray, of: Limbs) -> bool:
             return False
         if foot is not None and (_angle(foot, up) < 35 or _angle(foot, -ahead) < 35):
             return False
-    return True
+    hips, shoulders = (_between(places, of, f"right {part}", f"left {part}") for part in ("thigh", "arm"))
+    return hips is None or shoulders is None or _angle(hips, shoulders) < 50
 
 
 def is_even(places: np.ndarray, of: Limbs) -> bool:
@@ -168,8 +171,17 @@ def from_frame(motion: MotionRecord, of: Limbs, up: str, frame: int, note: str) 
     )
 
 
-def _among(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
-    """Return a T-, A- or N-pose of the first frames, the one whose halves are most alike; None where there is none."""
+def _at_end(last: MotionRecord, of: Limbs, up: str) -> Reference | None:
+    """Return a T-pose of the last frames; None where there is none. Whoever only stands there holds no pose."""
+    found = _among(last, of, up, arms=70)
+    return None if found is None else replace(found, note="the reference pose is a T-pose at the end")
+
+
+def _among(motion: MotionRecord, of: Limbs, up: str, arms: float = 0) -> Reference | None:
+    """Return a T-, A- or N-pose of some frames, the one whose halves are most alike; None where there is none.
+
+    Arms hang down with 0 degrees; poses with fewer than `arms` do not count.
+    """
     count = min(len(motion.poses), 10)
     first = replace(motion, poses=motion.poses[:count], translation=motion.translation[:count])
     places = forward(first)[1]
@@ -178,7 +190,7 @@ def _among(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
         axes = _person_axes(places[frame], of, up)
         own = places[frame] @ axes  # left, up, ahead
         off, spread = _asymmetry(own, of), _spread(own, of)
-        straight = is_person(own, of) and _bend(own, of) < 25
+        straight = spread >= arms and is_person(own, of) and _bend(own, of) < 25
         if straight and off < (12 if 25 < spread < 110 else 2) and (best is None or off < best[0]):
             kind = "T-pose" if spread > 70 else "A-pose" if spread > 25 else "pose with hanging arms"
             best = off, frame, kind

@@ -15,7 +15,9 @@ from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
 from ncs_jax.prepare.skeleton import LIMBS, body_axes, bone, forward, least_turn, rest_of, top, up_axis
 
-__all__ = ["Retargeted", "body_names", "paired", "retarget", "sole_heights", "turn_note", "up_rotation", "with_skeleton"]
+__all__ = [
+    "Retargeted", "body_names", "called", "paired", "retarget", "sole_heights", "turn_note", "up_rotation", "with_skeleton",
+]  # fmt: skip
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 LEG = 0.5, 1.1  # m from hip to ankle of a grown person, to tell units apart
@@ -52,6 +54,11 @@ def body_names(body: BodyRecord) -> tuple[str, ...]:
         return body.joint_names
     names = smpl_names(len(body.parents))
     return names if names and np.array_equal(body.parents, smpl_parents(len(names))) else ()
+
+
+def called(names: tuple[str, ...], bones: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what joints are called: the bone's name where the file's format says which joints are a person's bones."""
+    return tuple(bone or name for name, bone in zip(names, bones, strict=True)) if bones else names
 
 
 def with_skeleton(motion: MotionRecord, wanted: int) -> MotionRecord:
@@ -155,7 +162,8 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
             mend="write joint_names (J,) into the body's file",
         )  # fmt: skip
     rest, parents = rest_of(motion)
-    source, target = anatomy(motion.joint_names, parents.tolist(), rest), anatomy(names, body.parents.tolist(), body.joints)
+    source = anatomy(called(motion.joint_names, motion.bones), parents.tolist(), rest)
+    target = anatomy(called(names, body.bones), body.parents.tolist(), body.joints)
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
     if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
@@ -220,7 +228,7 @@ def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[st
 
 def _shown(motion: MotionRecord, places: np.ndarray) -> SkeletonPoses:
     """Return a motion's own skeleton, with joints at places (T, J, 3), in the frames that pictures show."""
-    return SkeletonPoses(places[shown_frames(len(places))], rest_of(motion)[1], motion.joint_names)
+    return SkeletonPoses(places[shown_frames(len(places))], rest_of(motion)[1], called(motion.joint_names, motion.bones))
 
 
 def _alignment(motion, body, source: Limbs, target: Limbs, pairs: dict[int, int], quarter, axes) -> np.ndarray:

@@ -21,7 +21,10 @@ def plane_distance(
     normals: Float[Array, "body 3 *poses"],
     index: Int[Array, "verts *poses"],
 ) -> Float[Array, "verts *poses"]:
-    """Return the signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside."""
+    """Return the signed distance in m to the tangent plane of the nearest vertex: d = n . (x - b), negative inside.
+
+    Its value jumps where the nearest vertex changes, so a finite difference across a jump does not meet the gradient.
+    """
     poses = index[:1].size
     at = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
 

@@ -19,7 +19,7 @@ __all__ = ["Fbx", "Packed", "Record", "read_fbx"]
 MAGIC = b"Kaydara FBX Binary  \0"
 DEEPEST = 32  # records in records
 MOST = 2_000_000  # records, and values that stand by themselves
-SINGLE = {b"Y": "<h", b"C": "<?", b"I": "<i", b"F": "<f", b"D": "<d", b"L": "<q"}
+SINGLE = {b"B": "<?", b"C": "<?", b"Z": "<b", b"Y": "<h", b"I": "<i", b"F": "<f", b"D": "<d", b"L": "<q"}
 ARRAYS = {b"f": "<f4", b"d": "<f8", b"l": "<i8", b"i": "<i4", b"b": "<i1", b"c": "<i1"}
 
 
@@ -103,7 +103,7 @@ def read_fbx(path: str | Path) -> Fbx:
     if data.startswith(MAGIC):
         root, version = _Binary(file, data).root()
     else:
-        root = _Text(file, data.decode("utf-8", errors="replace")).root()
+        root = _Text(file, data.decode("utf-8-sig", errors="replace")).root()
         version = root.first("FBXHeaderExtension").first("FBXVersion").value(0, int, 0)
     if not 7000 <= version < 8000:
         raise InputError("FBX 7 expected", file=file, field="version", value=version, mend="export it as FBX 2011 or newer")

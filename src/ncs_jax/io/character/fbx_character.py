@@ -14,6 +14,7 @@ from ncs_jax.io.character.fbx_graph import FbxModel, Graph, euler, graph_of, nam
 from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_triangles
 from ncs_jax.io.character.rig import body_of, rig_from
 from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
+from ncs_jax.io.character.spline import key_rate
 from ncs_jax.io.mesh.part import chosen_meshes, one_object
 from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.records import BodyRecord, MotionRecord
@@ -74,6 +75,7 @@ def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
 def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
     """Read an animation of an .fbx since the pose of `fbx_body`, at the file's frame rate; the first that moves, or the named.
 
+    The rate is the one that the file states, else that of its keys, as in glTF.
     Joints without curves keep their model's place. In a file without a skin (Mixamo's "Without Skin"), the rest pose is the one
     in which the models stand.
     """
@@ -86,7 +88,8 @@ def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
             graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces, sorted(set(turning))
         )
         wanted = rig.nodes.tolist()
-        found = motion_of(rig, (begin, end, graph.fps), lambda times: _worlds(graph, wanted, curves, times))
+        fps = graph.fps or key_rate(c.times for c in curves.values())
+        found = motion_of(rig, (begin, end, fps), lambda times: _worlds(graph, wanted, curves, times))
         return replace(found, notes=(*notes, *found.notes))
 
 
@@ -189,7 +192,8 @@ def _animation(graph: Graph, name: str) -> tuple[float, float, dict[tuple[int, s
     times = properties_of(stack)
     begin, end = (next(iter(times.get(n, [])), 0) / TICK for n in ("LocalStart", "LocalStop"))
     if not end > begin:
-        begin, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
+        keyed = [c.times for c in curves.values() if len(c.times) > 1] or [np.zeros(1)]
+        begin, end = min(t[0] for t in keyed), max(t[-1] for t in keyed)
     return float(begin), float(end), curves, notes
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_jax.io.character.fbx import Fbx, Record
-from ncs_jax.io.character.spline import hermite
+from ncs_jax.io.character.spline import hermite, onto_keys
 
 __all__ = ["Curve", "curve_from"]
 
@@ -30,7 +30,7 @@ class Curve:
         A cubic span is Hermite's. The weights of its tangents, which bend time along it, are ignored.
         """
         last = len(self.times) - 1
-        times = np.clip(times, self.times[0], self.times[-1])
+        times = onto_keys(np.clip(times, self.times[0], self.times[-1]), self.times)
         low = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, max(last - 1, 0))
         high = np.minimum(low + 1, last)
         span = self.times[high] - self.times[low]

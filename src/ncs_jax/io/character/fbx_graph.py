@@ -43,7 +43,8 @@ class FbxModel:
 class Graph:
     """All models, parents before children, and the connections: `below[key]` lists (object, property) under an object.
 
-    `to_metres` (4, 4) leads from the file's axes and unit to metres and Y up. `fps`: frames per second.
+    `to_metres` (4, 4) leads from the file's axes and unit to metres and Y up. `fps`: frames per second; 0 where the
+    file does not say.
     """
 
     fbx: Fbx
@@ -107,7 +108,7 @@ def properties_of(record: Record) -> dict[str, list]:
 
 
 def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
-    """Return the matrix (4, 4) from the file's axes and unit to metres and Y up, and the frames per second."""
+    """Return the matrix (4, 4) from the file's axes and unit to metres and Y up, and the frames per second, 0 for none."""
     given = properties_of(fbx.root.first("GlobalSettings"))
 
     def number(name: str, default: float) -> float:
@@ -124,9 +125,9 @@ def _settings(fbx: Fbx) -> tuple[np.ndarray, float]:
         raise fbx.wrong("three different axes, and a unit above 0, expected", "GlobalSettings", unit)
     out[:3] *= unit / 100  # the unit is in centimetres
     out[3, 3] = 1
-    mode = int(number("TimeMode", 6))
-    fps = RATES.get(mode, number("CustomFrameRate", 30.0) if mode == 14 else 30.0)
-    return out, fps if 10 <= fps <= 240 else 30.0
+    mode = int(number("TimeMode", 0))
+    fps = RATES.get(mode, number("CustomFrameRate", 0.0) if mode == 14 else 0.0)
+    return out, fps if 10 <= fps <= 240 else 0.0
 
 
 def euler(degrees: np.ndarray, order: str = "XYZ") -> np.ndarray:

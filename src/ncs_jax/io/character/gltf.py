@@ -1,4 +1,4 @@
-"""The container of glTF 2.0 (.glb, .vrm, .gltf): JSON, the buffers that it names, and the typed arrays in them."""
+"""The container of glTF 2.0 (.glb, .vrm, .vrma, .gltf): JSON, the buffers that it names, and the typed arrays in them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_mesh_quantization", "KHR_xmp",
     "KHR_animation_pointer", "VRM", "VRMC_", "KHR_draco_mesh_compression",
 )  # fmt: skip
-BINARY = (".glb", ".vrm")  # a .vrm is a .glb under another name
+BINARY = (".glb", ".vrm", ".vrma")  # those of VRM are .glb under another name
 
 
 @dataclass(eq=False)
@@ -208,7 +208,7 @@ class Gltf:
 
 
 def read_gltf(path: str | Path) -> Gltf:
-    """Open a .glb, .vrm or .gltf and check its header and JSON; accessors are read when they are asked for.
+    """Open a .glb, .vrm, .vrma or .gltf and check its header and JSON; accessors are read when they are asked for.
 
     Buffers may be in the file, in a data URI, or in another file of the same folder or below. Nothing else is opened.
     """

@@ -23,7 +23,8 @@ from ncs_jax.io.character.gltf_mesh import (
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, rig_from, unique_names
 from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
-from ncs_jax.io.character.spline import hermite
+from ncs_jax.io.character.spline import hermite, key_rate, onto_keys
+from ncs_jax.io.character.vrm import humanoid_bones
 from ncs_jax.io.mesh.part import chosen_meshes, one_object
 from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.records import BodyRecord, MotionRecord
@@ -71,7 +72,8 @@ def gltf_body(path: str | Path, part: Sequence[str] = (), shapes: Mapping[str, f
         pieces = _pieces(gltf, part, shapes)
         if not pieces:
             raise gltf.wrong("a skinned mesh expected", "skins", "none", "export the character with its skin")
-        return body_of(rig_from(gltf.file, nodes.names, nodes.parents, _worlds(nodes, range(len(nodes.names))), pieces))
+        rig = rig_from(gltf.file, nodes.names, nodes.parents, _worlds(nodes, range(len(nodes.names))), pieces)
+        return replace(body_of(rig), bones=humanoid_bones(gltf, rig, rig.names))
 
 
 def gltf_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
@@ -119,7 +121,7 @@ def _in_scene(gltf: Gltf, nodes: Nodes) -> list[int]:
 
 
 def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
-    """Read an animation of a .glb, .vrm or .gltf since the pose of `gltf_body`; the first that moves, or the named.
+    """Read an animation of a .glb, .vrm, .vrma or .gltf since the pose of `gltf_body`; the first that moves, or the named.
 
     The frames are the keys, if they have a constant rate of 10 to 240 a second; else there are 30 a second, from the first key
     to the last. Joints without keys keep their node's place. In a file without a skin, the rest pose is the one in which the
@@ -130,11 +132,14 @@ def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
         nodes = _nodes(gltf)
         tracks, notes = _animation(gltf, nodes, name)
         pieces = _pieces(gltf)
-        turning = sorted({t.node for t in tracks if t.path == "rotation" and np.ptp(t.values, axis=0).max() > 1e-4})
+        turning = sorted({t.node for t in tracks if t.path == "rotation" and _range(t) > 1e-4})
         rest = _worlds(nodes, range(len(nodes.names)))
         rig = rig_from(gltf.file, nodes.names, nodes.parents, rest, pieces, turning)
-        found = motion_of(rig, _span(tracks), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
-        return replace(found, notes=(*notes, *found.notes))
+        begin, end = min(float(t.times[0]) for t in tracks), max(float(t.times[-1]) for t in tracks)
+        fps = key_rate(t.times for t in tracks)
+        found = motion_of(rig, (begin, end, fps), lambda times: _worlds(nodes, rig.nodes.tolist(), tracks, times))
+        bones = humanoid_bones(gltf, rig, found.joint_names)
+        return replace(found, bones=bones, notes=(*notes, *found.notes))
 
 
 def _nodes(gltf: Gltf) -> Nodes:
@@ -227,7 +232,7 @@ def _animation(gltf: Gltf, nodes: Nodes, name: str) -> tuple[list[Channel], tupl
     every = range(len(names))
     _, found, notes = first_that_moves(
         names, [named] if name else every, lambda n: _tracks(gltf, nodes, n),
-        lambda tracks: any(np.ptp(t.values, axis=0).max() > 1e-6 for t in tracks), every,
+        lambda tracks: any(_range(t) > 1e-6 for t in tracks), every,
     )  # fmt: skip
     if not found:
         raise gltf.wrong(
@@ -271,10 +276,18 @@ def _track(gltf: Gltf, sampler: dict, node: int, path: str, label: str) -> Chann
     return Channel(node, path, times, values, mode)
 
 
+def _range(track: Channel) -> float:
+    """Return by how much a property changes from key to key, at most; a quaternion and its negative are one rotation."""
+    values = track.values[1::3] if track.mode == "CUBICSPLINE" else track.values
+    if track.path == "rotation":
+        values = np.where(values @ values[:1].T < 0, -values, values)
+    return float(np.ptp(values, axis=0).max())
+
+
 def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
     """Return a property (times, width) at times (s); constant before the first key and after the last."""
     keys, last = track.times, len(track.times) - 1
-    times = np.clip(times, keys[0], keys[-1])
+    times = onto_keys(np.clip(times, keys[0], keys[-1]), keys)
     low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, last)
     if track.mode == "STEP" or last == 0:
         values = track.values[1::3] if track.mode == "CUBICSPLINE" else track.values
@@ -293,15 +306,3 @@ def _sampled(track: Channel, times: np.ndarray) -> np.ndarray:
     if track.path == "rotation":
         found = found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-12)
     return found
-
-
-def _span(tracks: Sequence[Channel]) -> tuple[float, float, float]:
-    """Return begin and end of an animation, s, and its frames per second: those of the keys, or 30."""
-    begin, end = min(float(t.times[0]) for t in tracks), max(float(t.times[-1]) for t in tracks)
-    keys = np.unique(np.concatenate([np.round(t.times, 5) for t in tracks]))
-    if len(keys) > 2:
-        fps = (len(keys) - 1) / (end - begin)
-        even = np.abs(keys - np.linspace(begin, end, len(keys))).max() * fps < 0.01
-        if even and 10 <= fps <= 240:
-            return begin, end, float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else fps
-    return begin, end, 30.0

@@ -1,4 +1,4 @@
-"""Motions from .npz and .h5 (this package's, and AMASS's), from .bvh, and from animated characters in .glb, .gltf and .fbx."""
+"""Motions from .npz and .h5 (this package's, and AMASS's), from .bvh, and from animations in .glb, .gltf, .vrma and .fbx."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ READERS: dict[str, Callable[[str, str], MotionRecord]] = {
     ".glb": gltf_motion,
     ".gltf": gltf_motion,
     ".vrm": gltf_motion,
+    ".vrma": gltf_motion,
     ".fbx": fbx_motion,
 }
 FORMATS = (*TABLES, *READERS)
+PICKLED = (".pkl", ".pickle", ".pt", ".npy")  # they may run any code when they are read, or say not what they hold
 
 
 def read_motion(
@@ -57,7 +59,8 @@ def read_motion(
     """
     name, clip = split_clip(resolved(path))
     if (suffix := Path(name).suffix.lower()) not in FORMATS:
-        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend="convert it")
+        mend = "load it where it was made and write an .npz of poses, trans and fps" if suffix in PICKLED else "convert it"
+        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend=mend)
     if not 0 < scale < 1e6:
         raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
     if suffix in TABLES:

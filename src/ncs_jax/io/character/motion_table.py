@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.records import MotionRecord
 from ncs_jax.io.tables.table import Table, checked_parents, floats, select
 
@@ -17,11 +18,24 @@ FPS = ("fps", "mocap_framerate", "mocap_frame_rate")
 PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}  # of AMASS, in SMPL-X's order
 FIELDS = ("poses", "quaternions", "trans", "joint_names", "joints", "parents", *PARTS, *FPS)
 UNIT = 0.01  # by which the length of a unit quaternion, and a product of unit axes, may be off
+TURN = 2 * np.pi  # rad; more in a tenth of all rotations are no radians
+FIT = "rotations: fit SMPL to the joints' positions first (SMPLify, or the data set's own tool)"
+OTHERS = {  # arrays of others that hold a motion, and how to write it here
+    "smpl_poses": "poses = smpl_poses, trans = smpl_trans / smpl_scaling and fps = 60",
+    "body_pose": "poses = [global_orient, body_pose] (T, 3 J), trans = transl and fps",
+    "positions": FIT,
+    "joints": FIT,
+    "motion": "poses (T, J, 3), rotations as axis times angle, trans (T, 3) and fps",
+    "arr_0": "poses (T, J, 3), rotations as axis times angle, trans (T, 3) and fps",
+}
+SIX = "of a 6D rotation make a matrix: its two rows or columns at right angles, their cross product the third"
 CLEAR = 4  # times as many quaternions turn by less than 90 degrees in the order that is taken
 
 
 def table_motion(table: Table, frame_range: tuple[int, int | None] | None) -> MotionRecord:
     """Return the chosen frames of a motion: see `read_motion`."""
+    if not any(name in table for name in ("poses", "quaternions", "root_orient")):
+        _refuse_others(table)
     parts = "poses" not in table and "quaternions" not in table and "root_orient" in table
     field = "root_orient" if parts else table.first("poses", "quaternions")
     file, translation, fps = table.file, table.array("trans"), table.number(*FPS)
@@ -40,6 +54,19 @@ def table_motion(table: Table, frame_range: tuple[int, int | None] | None) -> Mo
         joints = table.floats("joints", (poses.shape[1], 3), ("joint",))
         parents = checked_parents(file, "parents", table.array("parents"), poses.shape[1], names)
     return MotionRecord(poses, moved, fps, names, joints, parents, up="" if "fps" in table else "z", notes=notes)
+
+
+def _refuse_others(table: Table) -> None:
+    """Raise an InputError that says how to write here what other files call otherwise, or what holds no rotations."""
+    for name, mend in OTHERS.items():
+        if name in table.names:
+            raise InputError(
+                "poses or quaternions expected",
+                file=table.file,
+                field=name,
+                value=", ".join(table.names)[:120],
+                mend=f"write {mend}",
+            )
 
 
 def chosen_frames(
@@ -77,7 +104,7 @@ def _rotations(table: Table, field: str) -> np.ndarray:
         expected = "(T, J, 3), (T, 3 J), (T, J, 4) or (T, J, 3, 3)" if field == "poses" else "(T, J, 4)"
         raise InputError(
             f"an array of shape {expected} expected", file=table.file, field=field, value=array.shape,
-            mend="write one rotation for each frame and joint",
+            mend=SIX if array.shape[2:] in ((6,), (3, 2), (2, 3)) else "write one rotation for each frame and joint",
         )  # fmt: skip
     return array
 
@@ -109,6 +136,15 @@ def _axis_angle(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return axis times angle (T, J, 3) of rotations in any form, and a note on what they were taken for."""
     if turned.shape[2:] == (3,):
+        if (np.linalg.norm(turned, axis=-1) > TURN).mean() > 0.1:
+            raise InputError(
+                "axis times angle in radians expected", file=file, field=field,
+                value=f"{np.linalg.norm(turned, axis=-1).max():.3g} at most", mend="of degrees, divide by 57.29578",
+            )  # fmt: skip
+        if _are_places(turned):
+            raise InputError(
+                "rotations expected, not the places of joints", file=file, field=field, value=turned.shape, mend=f"write {FIT}"
+            )
         return turned, ()
     if turned.ndim == 4:
         products = np.swapaxes(turned, -1, -2) @ turned
@@ -120,12 +156,28 @@ def _axis_angle(
     w_first, notes = True, tuple[str, ...]()
     if field == "quaternions":
         _refuse(file, field, turned, names, start, length < 1e-6, "a quaternion that is not zero")
+        first, last = ((np.abs(turned[..., k]) > np.sqrt(0.5) * length).mean() for k in (0, 3))
+        if first < 0.1 and last > 0.9:
+            raise InputError(
+                "w first expected", file=file, field=field, value=f"{100 * last:.0f} % are largest in the last component",
+                mend="they seem to be (x, y, z, w): write quaternions[..., [3, 0, 1, 2]]",
+            )  # fmt: skip
     else:
         _refuse(file, field, turned, names, start, np.abs(length - 1) > UNIT, "axis times angle, or a unit quaternion,")
         w_first = _w_is_first(file, turned)
         notes = (f"its poses are read as quaternions ({'w, x, y, z' if w_first else 'x, y, z, w'})",)
     turns = Rotation.from_quat(turned.reshape(-1, 4), scalar_first=w_first)
     return turns.as_rotvec().reshape(*turned.shape[:2], 3).astype(turned.dtype), notes
+
+
+def _are_places(turned: np.ndarray) -> bool:
+    """Tell whether "rotations" (T, J, 3) are places of SMPL's joints: they move, and all bones keep their lengths to 1 %."""
+    names = smpl_names(turned.shape[1])
+    if len(turned) < 2 or not names or np.ptp(turned, axis=0).max() < 0.01:
+        return False
+    parents = smpl_parents(len(names))[1:22]
+    bones = np.linalg.norm(turned[:, 1:22] - turned[:, parents], axis=-1)
+    return bool((np.ptp(bones, axis=0) < 0.01 * bones.mean(axis=0)).all())
 
 
 def _refuse(file: Path, field: str, turned: np.ndarray, names, start: int, bad: np.ndarray, expected: str) -> None:

@@ -140,10 +140,13 @@ def rig_from(
 
 
 def _rig_without_skin(file: Path, names: Sequence[str], parents: np.ndarray, rest: np.ndarray, turning: Sequence[int]) -> Rig:
-    """Return a rig without vertices: the nodes above, between and below those that turn, bound where they rest."""
+    """Return a rig without vertices: all below the lowest node above those that turn, at rest where they stand."""
     if not len(turning):
         raise InputError("a skin, or nodes that turn, expected", file=file, field="nodes", mend="export a skinned character")
-    root = lowest_common(parents, turning)
+    trees: dict[int, list[int]] = {}
+    for node in turning:
+        trees.setdefault(path_to_root(parents, node)[-1], []).append(node)
+    root = lowest_common(parents, max(trees.values(), key=len))  # cameras and lights may turn beside the skeleton
     joints = by_depth(parents, [n for n in range(len(parents)) if root in path_to_root(parents, n)])
     none = np.zeros((0, 3))
     return Rig(

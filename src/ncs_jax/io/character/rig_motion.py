@@ -29,7 +29,7 @@ Found = TypeVar("Found")
 
 def split_clip(path: str | Path) -> tuple[str, str]:
     """Return the file and the animation, or the ROOT, that `FILE.glb#NAME` names; the name is empty where none is given."""
-    found = re.match(r"(.+?\.(?:bvh|glb|vrm|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
+    found = re.match(r"(.+?\.(?:bvh|glb|vrma|vrm|gltf|fbx))(?:#(.*))?$", str(path), re.IGNORECASE | re.DOTALL)
     return (found[1], found[2] or "") if found else (str(path), "")
 
 
@@ -58,7 +58,8 @@ def first_that_moves(
 ) -> tuple[int, Found, tuple[str, ...]]:
     """Return the number of the first animation among candidates that moves, what was read of it, and a note on the others.
 
-    Where none moves, the first. `full` are those that could be chosen by name; `read` gives something empty for the others.
+    Where none moves, the first that is not empty. `full` are those that could be chosen by name; `read` gives something
+    empty for the others.
     """
     found = {}
     for number in candidates:
@@ -66,7 +67,7 @@ def first_that_moves(
         if moves(found[number]):
             break
     else:
-        number = candidates[0] if candidates else 0
+        number = next((n for n in candidates if found[n]), candidates[0] if candidates else 0)
     others = ", ".join(names[n] for n in full if n != number)
     note = (f"its animation {names[number]} is read; FILE#NAME reads another: {others[:400]}",) if others else ()
     return number, found[number] if found else read(number), note

@@ -2,9 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
-__all__ = ["hermite"]
+__all__ = ["hermite", "key_rate", "onto_keys"]
+
+ROUNDING = 1e-4  # s by which a time in single precision, or a frame's number over its rate, misses a key
+
+
+def onto_keys(times: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """Return times (n,), those at a key but for rounding moved onto it: just before it, a held value would be the last one."""
+    near = keys[np.searchsorted((keys[1:] + keys[:-1]) / 2, times)]
+    return np.where(np.abs(times - near) < ROUNDING, near, times)
+
+
+def key_rate(keys: Iterable[np.ndarray]) -> float:
+    """Return the frames per second of an animation's keys, s, if there are 10 to 240 a second at a constant rate; else 30."""
+    times = np.unique(np.concatenate([np.round(t, 5) for t in keys]))
+    if len(times) > 2:
+        fps = (len(times) - 1) / (times[-1] - times[0])
+        even = np.abs(times - np.linspace(times[0], times[-1], len(times))).max() * fps < 0.01
+        if even and 10 <= fps <= 240:
+            return float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else float(fps)
+    return 30.0
 
 
 def hermite(
