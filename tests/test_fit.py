@@ -249,3 +249,13 @@ def test_a_loose_garment_that_shoulders_carry_is_accepted_with_a_warning():
     assert not found.doubt and found.scale == 0.01
     assert np.linalg.norm(found.garment.vertices - given.vertices, axis=1).mean() < 0.01
     assert "what carries it tells its height" in found.warning
+
+
+def test_the_last_digits_of_the_body_do_not_move_the_place():
+    body, given = io.read_body(ASSETS / "body.npz"), shirt_with_a_skirt()
+    x = body.vertices.astype(np.float64)
+    noisy = replace(body, vertices=x + 1e-8 * np.random.default_rng(0).normal(size=x.shape))
+    moved = replace(given, vertices=(given.vertices + [-0.2, 0.1, 0.1]) / 0.0254)
+    places = [place("g.obj", moved, b) for b in (body, noisy)]
+    assert all(not p.doubt and (p.scale, p.up, p.turn) == (0.0254, "y", 0) for p in places)
+    np.testing.assert_allclose(places[0].shift, places[1].shift, atol=0.01)

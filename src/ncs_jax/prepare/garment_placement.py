@@ -23,6 +23,7 @@ COMMON = (1.0, 0.01, 0.001, 0.0254)  # units that need less of a reason than oth
 SIZES = 1 / 10, 1.15  # of the body's: what is worn is between
 STARTS = 3  # so many starts of every unit and orientation are followed
 FINE = 6  # so many of the best places are looked at closely
+BRIEFLY = 20  # so many steps of the exact search are taken before places are compared
 STEPS = 1 / 20, 1 / 320  # of the body's height: first and last step of the search
 SKIN = 1 / 80  # of the body's height: cloth is on the skin within about this distance
 ROUGH = 1 / 30, 3.0  # these two, while the places are found roughly
@@ -32,7 +33,7 @@ ON_BODY = 0.05  # least share of a garment that lies on the body
 STAYS = 1.1, 0.5  # the misfit may be so many times that of the best place, and so much of the contact must be there
 RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on, one in another unit from this one on
 APART = 0.02  # of the height: what is nearer is no other place
-FLAT, AWAY = 1.08, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
+FLAT, AWAY = 1.15, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
 HELD = 0.15, 1.0  # but not upward, where it loses so much of its contact, and so much as far down: something carries it
 
 
@@ -143,13 +144,13 @@ def place(
     here = [replace(here[i], cost=float(_misfit(*exact[i], skin))) for i in first[:FINE]]
     found = here if move is not None else [*_search(ways, cloth_of(raw, 100), fine, skin), *here]
     seen = [(w, _look(w, raw, fine, skin, body)) for w in found]
-    ranked = sorted(seen, key=lambda r: (bool(r[1].doubt), -_value(r[0], fine, skin)))
+    ranked = _ranked(seen, fine, skin)
     best = ranked[0][0]
     if move is None and best.prior < 1:  # the best place unturned too: most garments are alike from front and back
         plain = [w for w in ways if w.scale == best.scale and w.up == best.up[-1] and not w.turn]
         plain = [_moved(replace(w, shift=best.points(fine.middle) - w.points(fine.middle)), fine, skin) for w in plain]
         seen += [(w, _look(w, raw, fine, skin, body)) for w in plain]
-        ranked = sorted(seen, key=lambda r: (bool(r[1].doubt), -_value(r[0], fine, skin)))
+        ranked = _ranked(seen, fine, skin)
     return replace(ranked[0][1], doubt="") if move is not None else _choose(ranked, fine, skin)
 
 
@@ -173,8 +174,16 @@ def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
 
 
 def _search(ways: list[_Way], rough: Cloth, fine: Cloth, skin: Skin) -> list[_Way]:
-    """Return the best places: first on few points from many starts, then moved, then on many points."""
-    found = []
+    """Return the best places: of every unit from many starts on few points, then briefly on many; the best of all to the end.
+
+    The misfit on few points, or beside the place where it is least, compares nothing by a hair and no units with each other:
+    close cloth is half inside until it is moved.
+    """
+
+    def best(found: list[_Way]) -> list[_Way]:
+        return _different(sorted(found, key=lambda w: -_value(w, fine, skin)), skin)
+
+    near = []
     for unit in dict.fromkeys(w.scale for w in ways):
         first = []
         for way in (w for w in ways if w.scale == unit):
@@ -182,13 +191,13 @@ def _search(ways: list[_Way], rough: Cloth, fine: Cloth, skin: Skin) -> list[_Wa
             starts = np.concatenate([np.zeros((1, 3)), skin.places - way.points(rough.middle)])
             costs = _misfit(*skin.roughly(x + starts[:, None], normals), skin, *ROUGH)
             first += [replace(way, shift=starts[k]) for k in np.argsort(costs)[:STARTS]]
-        found += sorted(_stepped(first, rough, skin), key=lambda w: -_value(w, rough, skin))[: 2 * FINE]
-    found = _different(sorted(found, key=lambda w: -_value(w, rough, skin)), skin)[:FINE]
-    return _different(sorted((_moved(w, fine, skin) for w in found), key=lambda w: -_value(w, fine, skin)), skin)
+        near += [_moved(w, fine, skin, BRIEFLY) for w in best(_stepped(first, rough, fine, skin))[: 2 * FINE]]
+    return best([_moved(w, fine, skin) for w in best(near)[:FINE]])
 
 
-def _stepped(ways: list[_Way], cloth: Cloth, skin: Skin) -> list[_Way]:
-    """Return ways moved to where their rough misfit is least: by steps along the axes, which are halved where none helps."""
+def _stepped(ways: list[_Way], cloth: Cloth, fine: Cloth, skin: Skin) -> list[_Way]:
+    """Return ways moved to where their rough misfit is least, by steps along the axes, which are halved where none helps, and
+    the misfit of the fine cloth there."""
     x = np.stack([w.points(cloth.points) - w.shift for w in ways])
     normals = np.stack([cloth.normals @ w.turned for w in ways])
     at, step = np.stack([w.shift for w in ways]), np.full(len(ways), STEPS[0] * skin.height)
@@ -200,8 +209,8 @@ def _stepped(ways: list[_Way], cloth: Cloth, skin: Skin) -> list[_Way]:
         best = costs.argmin(axis=1)
         at = tried[every, best]
         step = np.where(best == 0, np.maximum(step / 2, STEPS[1] * skin.height), step)
-    exact = [_cost(a + b, n, skin) for a, b, n in zip(x, at, normals, strict=True)]
-    return [replace(w, shift=at[i], cost=exact[i]) for i, w in enumerate(ways)]
+    moved = [replace(w, shift=at[i]) for i, w in enumerate(ways)]
+    return [replace(w, cost=_cost(w.points(fine.points), fine.normals @ w.turned, skin)) for w in moved]
 
 
 def _different(ways: list[_Way], skin: Skin) -> list[_Way]:
@@ -214,15 +223,15 @@ def _different(ways: list[_Way], skin: Skin) -> list[_Way]:
     return kept
 
 
-def _moved(way: _Way, cloth: Cloth, skin: Skin) -> _Way:
-    """Return a way moved to where its misfit is least."""
+def _moved(way: _Way, cloth: Cloth, skin: Skin, most: int = 100) -> _Way:
+    """Return a way moved to where its misfit is least, by so many steps at most."""
     from scipy.optimize import minimize
 
     x, normals = way.points(cloth.points) - way.shift, cloth.normals @ way.turned
     simplex = way.shift + skin.height / 60 * np.vstack([np.zeros(3), np.eye(3)])
     best = minimize(
         lambda shift: _cost(x + shift, normals, skin), way.shift, method="Nelder-Mead",
-        options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": 100, "initial_simplex": simplex},
+        options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": most, "initial_simplex": simplex},
     )  # fmt: skip
     return replace(way, shift=best.x, cost=float(best.fun))
 
@@ -263,13 +272,21 @@ def _look(way: _Way, raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRec
     return Placement(garment, way.scale, way.up, way.turn, mirrored, way.shift, lying, inside, bones, share, doubt)
 
 
+def _ranked(seen: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> list[tuple[_Way, Placement]]:
+    """Return places, the best first: what speaks against none, then what touches the body, then by value."""
+    return sorted(seen, key=lambda r: (bool(r[1].doubt), r[1].lying < ON_BODY, -_value(r[0], cloth, skin)))
+
+
 def _choose(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> Placement:
     """Return the best place, or the garment's own where that is about as good, with what speaks against it."""
     way, best = ranked[0]
-    top, refused = max(ranked, key=lambda r: (_size(r[0], cloth) > TINY * skin.height, _value(r[0], cloth, skin)))
+    large = [r for r in ranked if _size(r[0], cloth) > TINY * skin.height] or ranked
+    top, refused = max(large, key=lambda r: (r[1].lying >= ON_BODY, _value(r[0], cloth, skin)))
     placed = not way.shift.any() and not way.turn
     if best.doubt or (not placed and _value(way, cloth, skin) < RIVAL * _value(top, cloth, skin)):
         return refused  # what lies far better there is worn there, though it cannot be: a shirt is no sock
+    if not placed and way.cost > SKIN * skin.height:
+        return replace(best, doubt=f"{100 * best.inside:.0f} % of it are inside the body, too deep for what lies on it")
     least = _value(way, cloth, skin)
     least = least * STAYS[1] if least > 0 else least / STAYS[1]
     for own, look in sorted(ranked, key=lambda r: (not r[0].own, -r[0].prior)):
@@ -319,6 +336,7 @@ def _rivals(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> s
         share = RIVAL if other.scale == way.scale else RESIZED
         apart = tree.query(other.points(cloth.points))[0].mean()
         good = _value(other, cloth, skin) > (least * share if least > 0 else least / share)
+        good |= other.scale == way.scale and other.cost < RIVAL * way.cost  # only how usual its turn is speaks against it
         if good and not look.doubt and apart > APART * skin.height:
             return f"it lies about as well elsewhere, with {look.options}"
     return ""
