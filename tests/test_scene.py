@@ -122,3 +122,13 @@ def test_the_default_cell_is_what_the_scene_can_be_trained_with(changes, cell):
     found = with_cell(scene_from(changes))
     assert found.network.cell == cell
     assert with_cell(scene_from(found.to_dict())) == scene_from(found.to_dict())  # as a run keeps it
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("dress.npz", r"a \.npz"), ("folder", "a folder"), ("dress", "a file without suffix")]
+)
+def test_what_is_no_scene_file_is_said_to_be_none(tmp_path, name, found):
+    """A garment or a run in a scene's place is no broken TOML."""
+    (tmp_path / name).mkdir() if name == "folder" else (tmp_path / name).write_bytes(b"\x93")
+    with pytest.raises(InputError, match=rf"ends in \.toml expected \(found '{found}'\).*ncs fit writes one"):
+        load_scene(tmp_path / name)

@@ -305,6 +305,10 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
         from ncs_jax.io.packaged import packaged
 
         file = packaged(str(path)[4:], ".toml")
+    elif file.exists() and file.suffix.lower() != ".toml":
+        kind = "a folder" if file.is_dir() else f"a {file.suffix or 'file without suffix'}"
+        mend = "of a garment, ncs fit writes one; of a run, ncs view and ncs evaluate read its folder"
+        raise InputError("a scene file that ends in .toml expected", file=file, value=kind, mend=mend)
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
