@@ -109,7 +109,8 @@ def _training_features(setting: Setting) -> MotionFeatures:
 
 def _tell_a_person(words: str) -> None:
     """Write what takes long to stderr, where a person sees it: in a terminal or a notebook."""
-    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+    shell = sys.modules.get("IPython")
+    if sys.stderr.isatty() or (shell is not None and shell.get_ipython() is not None):
         sys.stderr.write(f"ncs_jax: {words} ...\n")
 
 
