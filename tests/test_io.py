@@ -185,7 +185,7 @@ def test_garment_npz(tmp_path):
     record = io.read_garment(save(tmp_path / "g.npz", garment()))
     np.testing.assert_array_equal(record.vertices, STRIP[0])
     np.testing.assert_array_equal(record.faces, STRIP[1])
-    np.testing.assert_array_equal(record.uv, STRIP[0][:, :2])
+    np.testing.assert_array_equal(record.uv, STRIP[0][STRIP[1], :2])
     assert {k: v.tolist() for k, v in record.groups.items()} == {"pins": [1, 3]}
 
 
@@ -194,13 +194,33 @@ def test_garment_obj_keeps_order_fans_polygons_and_reads_uv(tmp_path):
     record = io.read_garment(tmp_path / "g.obj")
     np.testing.assert_array_equal(record.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 2, 0]])
     assert record.faces.tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 4]]
-    np.testing.assert_array_equal(record.uv, [[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 2]])
+    np.testing.assert_array_equal(record.uv, np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 2]])[record.faces])
 
 
 def test_garment_obj_with_a_texture_seam_is_not_split(tmp_path):
     (tmp_path / "g.obj").write_text(OBJ.replace("f -2/-2 -3/-3/1", "f -2/1 -3/-3/1"))
     record = io.read_garment(tmp_path / "g.obj")
-    assert record.vertices.shape == (5, 3) and record.uv is None
+    assert record.vertices.shape == (5, 3)
+    np.testing.assert_array_equal(record.uv[2], [[0, 0], [1, 1], [0.5, 2]])  # face 1 has (0, 1) at the same vertex
+    (tmp_path / "g.obj").write_text(OBJ.replace("f -2/-2 -3/-3/1 -1/5", "f -2 -3 -1"))
+    record = io.read_garment(tmp_path / "g.obj")
+    assert record.uv is None and "1 triangles have no texture coordinates" in record.notes[0]
+
+
+@pytest.mark.parametrize("name", ["a", "a.glb", "a.usdc"])
+def test_texture_seams_are_written_and_read_again(tmp_path, name):
+    if name.endswith("usdc"):
+        pytest.importorskip("pxr")
+    x, faces = STRIP
+    uv = np.random.default_rng(0).random((len(faces), 3, 2)).round(3)
+    uv[0] = x[faces[0], :2]
+    moving = np.stack([x, x + [0, 0, 0.5]]).astype(np.float32)
+    io.write_animation(tmp_path / name, moving, faces, 25, uv=uv)
+    record = io.read_garment(tmp_path / name / "frame_0000.obj" if name == "a" else tmp_path / name)
+    np.testing.assert_array_equal(record.vertices[record.faces], x[faces])
+    np.testing.assert_allclose(record.uv, uv, atol=1e-6)
+    io.write_garment(tmp_path / "g.npz", record)
+    np.testing.assert_array_equal(io.read_garment(tmp_path / "g.npz").uv, record.uv)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb"])

@@ -179,7 +179,7 @@ def material_axes(
         np.broadcast_to(np.roll(first, 1), normal.shape)
     )
     if uv is not None:
-        q = np.asarray(uv, np.float64)[faces]
+        q = np.asarray(uv, np.float64) if np.ndim(uv) == 3 else np.asarray(uv, np.float64)[faces]
         d1, d2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
         det = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
         mapped = (d1[:, :1] * e2 - d2[:, :1] * e1) * np.sign(det)[:, None]
@@ -201,7 +201,8 @@ def mesh_from(
 
     Args:
         vertices: (verts, 3) rest positions in m. faces: (faces, 3) vertex indices of a manifold mesh.
-        uv: (verts, 2) texture coordinates, whose v direction is the warp. warp: the warp direction where there is no UV map.
+        uv: (faces, 3, 2) texture coordinates of corners, or (verts, 2) of vertices, whose v direction is the warp.
+        warp: the warp direction where there is no UV map.
         dtype: jnp.float32 or jnp.float64.
 
     Raises:

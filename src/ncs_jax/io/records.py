@@ -47,11 +47,12 @@ class GarmentRecord:
     """A garment in its rest shape on the resting body: an oriented manifold triangle mesh, usually with boundary.
 
     Attributes:
-        vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (V, 2) texture coordinates, or None where the file has none
-            or a vertex has several. groups: named vertex sets, each sorted int32. scale, up: the file's unit in metres and its
-            axis that is up; both are already applied. welded: how many of the file's vertices were merged into another.
-            weights: (V, J) skinning weights, not negative, every row sums to 1; None: the body's. joint_names: the J joints of
-            the weights, none where they are the body's, in its order. notes: what was mended in the file.
+        vertices: (V, 3) rest positions, m. faces: (F, 3) int32. uv: (F, 3, 2) texture coordinates of the triangles' corners, v
+            upward: at a seam a vertex has several; None where the file has none. groups: named vertex sets, each sorted int32.
+            scale, up: the file's unit in metres and its axis that is up; both are already applied. welded: how many of the
+            file's vertices were merged into another. weights: (V, J) skinning weights, not negative, every row sums to 1; None:
+            the body's. joint_names: the J joints of the weights, none where they are the body's, in its order. notes: what was
+            mended in the file.
     """
 
     vertices: np.ndarray

@@ -108,6 +108,14 @@ def _mesh(a: Setting) -> Iterator[Risk]:
         yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
 
 
+def _grain(a: Setting) -> Iterator[Risk]:
+    """Yield the risk of a membrane that differs along warp and weft where no texture coordinates say which is which."""
+    if a.scene.physics.membrane.model == "baraff_witkin" and a.garment.uv is None:
+        value = "baraff_witkin, of a garment without texture coordinates"
+        risk = "the warp is taken to be up and down on the body, whatever the cut"
+        yield Risk("warp and weft", value, risk, 'export the garment with its UV map, or physics.membrane.model = "stvk"')
+
+
 def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return how deep in the body the garment is as the body alone carries it (poses, verts), m, or -`CLEAR` if clear of it."""
     model, body = a.model, required(a.body, "body")
@@ -198,7 +206,7 @@ def find_risks(a: Setting) -> list[Risk]:
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
         found += _shows(a, faces)
-    found += [*_postures(a), *_material(a.scene), *_mesh(a)]
+    found += [*_postures(a), *_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:
         found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
     for name in a.motions:

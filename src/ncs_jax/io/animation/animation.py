@@ -12,7 +12,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.animation.glb import write_glb
 from ncs_jax.io.animation.mdd import read_mdd, write_mdd
 from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
-from ncs_jax.io.mesh.obj import format_obj
+from ncs_jax.io.mesh.obj import format_obj, obj_faces
 from ncs_jax.io.mesh.usd import USD, read_usd_animation, write_usd
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
@@ -34,6 +34,7 @@ def write_animation(
     fps: float | int,
     *,
     rest: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | None = None,
 ) -> None:
     """Write a moving mesh in the format of the suffix; the file or folder appears whole or not at all.
@@ -45,8 +46,9 @@ def write_animation(
 
     Args:
         path: the file to write; missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
-        rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. worn_by: the body and its motion of T frames,
-            to be written into a .glb too.
+        rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. uv: (F, 3, 2) texture coordinates of the
+            triangles' corners, which .glb, USD and .obj hold and the other formats leave out. worn_by: the body and its motion
+            of T frames, to be written into a .glb too.
 
     Raises:
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
@@ -61,6 +63,7 @@ def write_animation(
         raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)
     if not 0 < float(fps) < np.inf:
         raise InputError("a number above 0 expected", file=file, field="fps", value=fps)
+    maps = None if uv is None else floats(file, "uv", np.asarray(uv), (len(triangles), 3, 2), ("face", "corner"))
     if suffix == ".npz":
         write_npz(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     elif suffix == ".pc2":
@@ -68,14 +71,14 @@ def write_animation(
     elif suffix == ".mdd":
         write_mdd(file, x, float(fps))
     elif suffix == ".glb":
-        write_glb(file, x, triangles, float(fps), worn_by)
+        write_glb(file, x, triangles, float(fps), uv=maps, worn_by=worn_by)
     elif suffix in USD:
         given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
-        write_usd(file, x, triangles, float(fps), given)
+        write_usd(file, x, triangles, float(fps), given, maps)
     elif suffix:
         write_hdf5(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
     else:
-        _write_folder(file, x, triangles, float(fps))
+        _write_folder(file, x, obj_faces(triangles, maps), float(fps))
 
 
 def animation_suffix(path: str | Path) -> str:
@@ -93,8 +96,8 @@ def animation_suffix(path: str | Path) -> str:
     return suffix
 
 
-def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: float) -> None:
-    text = ("f %d %d %d\n" * len(faces)) % tuple((faces.reshape(-1) + 1).tolist())
+def _write_folder(path: Path, vertices: np.ndarray, faces: str, fps: float) -> None:
+    """Write a file a frame; `faces` is text of `obj_faces`."""
     folder = path.expanduser()
     with replacing(folder) as part:
         if folder.exists() and not folder.is_dir():
@@ -109,7 +112,7 @@ def _write_folder(path: Path, vertices: np.ndarray, faces: np.ndarray, fps: floa
         part.mkdir()
         for t, x in enumerate(vertices):
             (part / f"frame_{t:04}.obj").write_text(
-                f"# frame {t} of {len(vertices)} at {fps:g} per second\n{format_obj(x, text)}"
+                f"# frame {t} of {len(vertices)} at {fps:g} per second\n{format_obj(x, faces)}"
             )
 
 

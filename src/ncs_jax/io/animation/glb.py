@@ -6,12 +6,14 @@ import json
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 
@@ -19,7 +21,7 @@ __all__ = ["write_glb", "write_glb_body"]
 
 FLOAT, SHORT, INT = 5126, 5123, 5125  # glTF's codes for types of numbers
 VERTICES, INDICES = 34962, 34963  # glTF's codes for the use of a buffer view
-SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LARGEST = 2**32 - 1  # bytes that the header can count
 DESCRIPTION = 1000  # bytes; the JSON of a frame or a joint takes less
 MOST = 8  # joints that move a vertex, as in the package's own skinning
@@ -31,6 +33,8 @@ def write_glb(
     vertices: np.ndarray,
     faces: np.ndarray,
     fps: float,
+    *,
+    uv: np.ndarray | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | None = None,
 ) -> None:
     """Write a moving mesh that plays in any viewer of glTF; the file appears whole or not at all.
@@ -40,17 +44,20 @@ def write_glb(
     lines between two frames. A frame takes 24 bytes a vertex, and the weights take 4 bytes times the frames squared: 32 MB and
     0.4 MB for 300 frames of 4,500 vertices. The sum that a viewer makes equals the frame to rounding of float32.
 
+    glTF holds one texture coordinate a vertex: at seams a vertex is written several times, with its one normal.
+
     A body is a skinned mesh on joints that the same animation turns, without pose correctives. The 8 largest weights of a
     vertex are kept, the largest first, because some viewers know only the first 4.
 
     Args:
         path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
-        worn_by: the body and its motion of T frames.
+        uv: (F, 3, 2) texture coordinates of corners, v upward. worn_by: the body and its motion of T frames.
 
     Raises:
         InputError: the file would be larger than 4 GiB, which the format cannot count, or it cannot be written.
     """
-    frames, count = vertices.shape[:2]
+    split = _split(vertices.shape[1], faces, uv)
+    frames, count = len(vertices), len(split.vertex)
     size = 24 * frames * count + 4 * frames * frames + 4 * faces.size + DESCRIPTION * frames
     if worn_by is not None:
         body, motion = worn_by
@@ -62,7 +69,7 @@ def write_glb(
         )  # fmt: skip
     document = _Document()
     keys = None if frames == 1 else document.array((np.arange(frames) / fps).astype("<f4")[:, None], bounded=True)
-    _garment(document, vertices, faces, keys)
+    _garment(document, vertices, faces, split, keys)
     if worn_by is not None:
         _body(document, *worn_by, keys)
     _write(path, document)
@@ -159,15 +166,39 @@ class _Document:
         return head | {name: things for name, things in own.items() if things}
 
 
-def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, keys: int | None) -> None:
+class _Split(NamedTuple):
+    """Vertices as glTF holds them: which of the mesh each is (N,), its texture coordinate (N, 2) or None, and the faces."""
+
+    vertex: np.ndarray
+    uv: np.ndarray | None
+    faces: np.ndarray
+
+
+def _split(count: int, faces: np.ndarray, uv: np.ndarray | None) -> _Split:
+    """Return the vertices, one for each of their texture coordinates: the first in the mesh's order, the others after all."""
+    if uv is None:
+        return _Split(np.arange(count), None, faces)
+    maps = uv.reshape(-1, 2) * [1, -1] + [0, 1]
+    rows = np.concatenate([faces.reshape(-1, 1), maps], axis=1)
+    kept, number = distinct(rows)
+    vertex = rows[kept, 0].astype(np.int64)
+    again = np.ones(len(kept), bool)
+    again[np.unique(vertex, return_index=True)[1]] = False
+    place = np.where(again, count + np.cumsum(again) - 1, vertex)
+    source, own = np.arange(count + int(again.sum())), np.zeros((count + int(again.sum()), 2), np.float32)
+    source[place], own[place] = vertex, maps[kept]
+    return _Split(source, own, place[number].reshape(-1, 3))
+
+
+def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, split: _Split, keys: int | None) -> None:
     """Add the garment: its mesh, a morph target for each later frame, and their weights over time."""
-    frames, count = vertices.shape[:2]
+    frames, count = len(vertices), len(split.vertex)
 
     def shapes() -> Iterator[np.ndarray]:
         first = vertices[0], vertex_normals(vertices[0], faces)
         for t, x in enumerate(vertices):
             for now, then in zip((x, vertex_normals(x, faces)), first, strict=True):
-                yield (now - then if t else now).astype("<f4")
+                yield (now - then if t else now).astype("<f4")[split.vertex]
 
     def weights() -> Iterator[np.ndarray]:
         return ((np.arange(1, frames) == t).astype("<f4") for t in range(frames))
@@ -185,7 +216,9 @@ def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, keys:
                 "NORMAL": document.accessor(view, place + 12 * count, FLOAT, count, "VEC3"),
             }
         )
-    primitive = {"attributes": attributes[0], "indices": document.corners(faces, count)}
+    if split.uv is not None:
+        attributes[0]["TEXCOORD_0"] = document.array(split.uv.astype("<f4"), target=VERTICES)
+    primitive = {"attributes": attributes[0], "indices": document.corners(split.faces, count)}
     if keys is None:
         document.mesh("garment", primitive, CLOTH)
         return

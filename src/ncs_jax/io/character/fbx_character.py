@@ -12,7 +12,7 @@ from ncs_jax.io.character.fbx import Record, read_fbx
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
 from ncs_jax.io.character.fbx_graph import FbxModel, Graph, euler, graph_of, name_of, properties_of
 from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_triangles
-from ncs_jax.io.character.rig import body_of, rig_from
+from ncs_jax.io.character.rig import body_of, rig_from, together
 from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
 from ncs_jax.io.character.spline import key_rate
 from ncs_jax.io.mesh.part import chosen_meshes, one_object
@@ -62,14 +62,19 @@ def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         if all(d.skin is not None for d in worn):
             names = [m.name for m in graph.models]
             rig = rig_from(file, names, graph.parents, worlds, fbx_pieces(graph, worn=worn))
-            return RawGarment(file, rig.vertices, rig.faces, weights=rig.weights, joint_names=rig.names, notes=rig.notes)
+            return RawGarment(
+                file, rig.vertices, rig.faces, rig.uv, weights=rig.weights, joint_names=rig.names, notes=rig.notes
+            )
         parts, start = [], 0
         for d in worn:
-            (x, faces), matrix = fbx_triangles(graph, d, {}), worlds[d.model]
-            outward = faces if np.linalg.det(matrix[:3, :3]) > 0 else faces[:, ::-1]
-            parts.append((x @ matrix[:3, :3].T + matrix[:3, 3], outward + start))
+            (x, faces, uv), matrix = fbx_triangles(graph, d, {}), worlds[d.model]
+            step = 1 if np.linalg.det(matrix[:3, :3]) > 0 else -1
+            parts.append(
+                (x @ matrix[:3, :3].T + matrix[:3, 3], faces[:, ::step] + start, None if uv is None else uv[:, ::step])
+            )
             start += len(x)
-        return RawGarment(file, np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]))
+        x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+        return RawGarment(file, x, faces, together([p[2] for p in parts]))
 
 
 def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:

@@ -11,7 +11,7 @@ from ncs_jax.io.character.fbx import Record
 from ncs_jax.io.character.fbx_graph import Graph, euler, name_of, properties_of
 from ncs_jax.io.character.rig import Piece
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes
-from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.polygons import triangle_corners
 
 __all__ = ["FbxMesh", "fbx_meshes", "fbx_pieces", "fbx_triangles"]
 
@@ -73,8 +73,11 @@ def _blend_shapes(graph: Graph, mesh: FbxMesh) -> dict[str, tuple[float, Record]
     return found
 
 
-def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3), moved by blend shapes, and triangles (F, 3) of a mesh, in its model's space."""
+def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return vertices (V, 3), moved by blend shapes, triangles (F, 3) and their texture coordinates (F, 3, 2), if any.
+
+    The vertices are in the space of the mesh's model.
+    """
     fbx, model = graph.fbx, graph.models[mesh.model]
     where = f"mesh of {model.name}"
     x = fbx.array(mesh.record, "Vertices", where)
@@ -97,15 +100,37 @@ def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> t
     x = (x * scale) @ euler(model.vector("GeometricRotation")).T + model.vector("GeometricTranslation")
     counts = np.diff(np.flatnonzero(last), prepend=-1)
     area = np.repeat(counts > 2, counts)  # edges that stand by themselves are polygons of two corners
-    faces = triangulate(fbx.file, x, counts[counts > 2], corners[area])
-    return x, faces if scale.prod() > 0 else faces[:, ::-1]
+    cut = np.flatnonzero(area)[triangle_corners(fbx.file, x, counts[counts > 2], corners[area])][
+        :, :: 1 if scale.prod() > 0 else -1
+    ]
+    uv = _texture_coordinates(graph, mesh, corners)
+    return x, corners[cut].astype(np.int32), None if uv is None else uv[cut]
+
+
+def _texture_coordinates(graph: Graph, mesh: FbxMesh, corners: np.ndarray) -> np.ndarray | None:
+    """Return the first texture coordinates (N, 2) of polygons' corners (N,), or None."""
+    layer, where = mesh.record.first("LayerElementUV"), f"mesh of {graph.models[mesh.model].name} LayerElementUV"
+    mapping = layer.first("MappingInformationType").value(0, str, "")
+    by_corner, by_vertex = mapping == "ByPolygonVertex", mapping in ("ByVertice", "ByVertex")
+    if not (by_corner or by_vertex):
+        return None
+    table = graph.fbx.array(layer, "UV", where)
+    number = np.arange(len(corners)) if by_corner else corners
+    if layer.first("ReferenceInformationType").value(0, str, "") in ("IndexToDirect", "Index"):
+        index = graph.fbx.array(layer, "UVIndex", where, whole=True)
+        if number.max() >= len(index):
+            raise graph.fbx.wrong(f"{number.max() + 1} numbers expected", f"{where} UVIndex", len(index))
+        number = index[number]
+    if len(table) % 2 or number.max() >= len(table) // 2:
+        raise graph.fbx.wrong(f"{number.max() + 1} pairs expected", f"{where} UV", f"{len(table)} numbers")
+    return None if number.min() < 0 else table.reshape(-1, 2)[number]  # -1: the corner has none
 
 
 def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
     """Return the triangles of one mesh with the joints and weights of its skin."""
     fbx, model = graph.fbx, graph.models[mesh.model]
     where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
-    x, faces = fbx_triangles(graph, mesh, shapes)
+    x, faces, uv = fbx_triangles(graph, mesh, shapes)
     rows: list[tuple[np.ndarray, np.ndarray]] = []
     nodes, binds, bounds = [], [], []
     for key, cluster, _ in graph.under(mesh.skin or 0, "Deformer", "Cluster"):
@@ -135,4 +160,4 @@ def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
     owners[vertex, slot], weights[vertex, slot] = owner, np.maximum(weight, 0)
     sums = weights.sum(axis=1, keepdims=True)
     weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
-    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])
+    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0], uv=uv)

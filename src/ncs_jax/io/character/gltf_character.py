@@ -21,7 +21,7 @@ from ncs_jax.io.character.gltf_mesh import (
     triangles_of,
 )
 from ncs_jax.io.character.hierarchy import path_to_root
-from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, rig_from, unique_names
+from ncs_jax.io.character.rig import MOST_NODES, Piece, body_of, rig_from, together, unique_names
 from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
 from ncs_jax.io.character.spline import hermite, key_rate, onto_keys
 from ncs_jax.io.character.vrm import humanoid_bones
@@ -97,17 +97,25 @@ def gltf_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         if all(d.skin >= 0 for d in worn):
             rig = rig_from(gltf.file, nodes.names, nodes.parents, worlds, _pieces(gltf, worn=worn))
             return RawGarment(
-                gltf.file, rig.vertices, rig.faces, splits=True, weights=rig.weights, joint_names=rig.names, notes=rig.notes
+                gltf.file,
+                rig.vertices,
+                rig.faces,
+                rig.uv,
+                splits=True,
+                weights=rig.weights,
+                joint_names=rig.names,
+                notes=rig.notes,
             )
         parts, start = [], 0
         for d in worn:
             x, faces = triangles_of(gltf, d, {})
-            parts.append((x @ worlds[d.node, :3, :3].T + worlds[d.node, :3, 3], oriented(faces, worlds[d.node]) + start))
+            faces, uv = oriented(faces, worlds[d.node]), texture_coordinates(gltf, d, len(x))
+            parts.append(
+                (x @ worlds[d.node, :3, :3].T + worlds[d.node, :3, 3], faces + start, None if uv is None else uv[faces])
+            )
             start += len(x)
-        maps = [texture_coordinates(gltf, d, len(x)) for d, (x, _) in zip(worn, parts, strict=True)]
-        uv = None if any(m is None for m in maps) else np.concatenate([m for m in maps if m is not None])
         x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-        return RawGarment(gltf.file, x, faces, uv, splits=True)
+        return RawGarment(gltf.file, x, faces, together([p[2] for p in parts]), splits=True)
 
 
 def _in_scene(gltf: Gltf, nodes: Nodes) -> list[int]:

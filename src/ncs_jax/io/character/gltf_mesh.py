@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.io.character.draco import unpack_draco
 from ncs_jax.io.character.gltf import Gltf
-from ncs_jax.io.character.rig import Piece
+from ncs_jax.io.character.rig import Piece, together
 from ncs_jax.io.mesh.part import NamedMesh
 
 __all__ = [
@@ -167,12 +167,13 @@ def skinned_piece(gltf: Gltf, skin: int, drawn: Sequence[Drawn], shapes: Mapping
     for d in drawn:
         x, faces = triangles_of(gltf, d, shapes)
         owners, weights = _influences(gltf, d, len(x), len(joints))
-        parts.append((x, faces + start, owners, weights))
+        uv = texture_coordinates(gltf, d, len(x))
+        parts.append((x, faces + start, owners, weights, None if uv is None else uv[faces]))
         start += len(x)
     width = max(p[2].shape[1] for p in parts)
     owners, weights = (np.concatenate([np.pad(p[k], ((0, 0), (0, width - p[k].shape[1]))) for p in parts]) for k in (2, 3))
     x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen)
+    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen, uv=together([p[4] for p in parts]))
 
 
 def _influences(gltf: Gltf, drawn: Drawn, count: int, joints: int) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ __all__ = [
     "quarter_turns",
     "rest_rotations",
     "rig_from",
+    "together",
     "unique_names",
 ]
 
@@ -38,7 +39,7 @@ class Piece:
         vertices: (V, 3) in the space where they were bound. faces: (F, 3). owners, weights: (V, K), numbers into `nodes`, and
             how much each moves the vertex. nodes: (S,) of the file. inverse_binds: (S, 4, 4) from that space to each node.
             bound: (4, 4) from that space to the world, None where the file does not say. chosen: whether the triangles are
-            wanted, or only what they tell of the joints.
+            wanted, or only what they tell of the joints. uv: (F, 3, 2) texture coordinates of the triangles' corners, or None.
     """
 
     vertices: np.ndarray
@@ -49,6 +50,7 @@ class Piece:
     inverse_binds: np.ndarray
     bound: np.ndarray | None = None
     chosen: bool = True
+    uv: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class Rig:
         file: the path. nodes: (J,) the file's nodes that are the joints. names: their names. parents: (J,), -1 for the root.
             binds: (J, 4, 4) joint to world in the bind pose. used: (J,) whether a joint, or one below it, moves some vertex.
             vertices: (V, 3). faces: (F, 3). weights: (V, J). A file without a skin has no vertices. notes: what was mended.
+            uv: (F, 3, 2) or None, as of the pieces.
     """
 
     file: Path
@@ -71,6 +74,12 @@ class Rig:
     faces: np.ndarray
     weights: np.ndarray
     notes: tuple[str, ...] = ()
+    uv: np.ndarray | None = None
+
+
+def together(uv: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Return the texture coordinates of all parts of a mesh; None where a part has none."""
+    return np.concatenate([part for part in uv if part is not None]) if all(part is not None for part in uv) else None
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -128,14 +137,14 @@ def rig_from(
                 binds.setdefault(node, to_world @ np.linalg.inv(inverse))
         if piece.chosen:
             placed.append(_placed(piece, to_world, number))
-    vertices, faces, weights = _joined(file, placed, len(joints))
+    vertices, faces, weights, uv = _joined(file, placed, len(joints))
     above = nearest_parents(parents, joints)
     used = np.array([n in moving for n in joints])
     for j in range(len(joints) - 1, 0, -1):
         used[above[j]] |= used[j]
     return Rig(
         file, np.array(joints), unique_names([names[n] for n in joints]), above, _all_binds(joints, above, rest, binds), used,
-        vertices, faces, weights, tuple(dict.fromkeys(notes)),
+        vertices, faces, weights, tuple(dict.fromkeys(notes)), uv,
     )  # fmt: skip
 
 
@@ -259,15 +268,20 @@ def quarter_turns() -> np.ndarray:
     return np.round(Rotation.create_group("O").as_matrix())
 
 
-def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple:
+    """Return vertices in the world, faces, their owners among the joints and weights, and texture coordinates."""
     x = piece.vertices @ to_world[:3, :3].T + to_world[:3, 3]
-    faces = piece.faces if np.linalg.det(to_world[:3, :3]) > 0 else piece.faces[:, ::-1]
+    step = 1 if np.linalg.det(to_world[:3, :3]) > 0 else -1
+    faces, uv = piece.faces[:, ::step], None if piece.uv is None else piece.uv[:, ::step]
     number = np.array([place.get(int(n), 0) for n in piece.nodes])
-    return x, faces, number[np.where(piece.weights > 0, piece.owners, 0)], piece.weights
+    return x, faces, number[np.where(piece.weights > 0, piece.owners, 0)], piece.weights, uv
 
 
-def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and dense weights of all pieces; vertices at one place (to 1 um) with equal weights are merged."""
+def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return vertices, faces, dense weights and texture coordinates of all pieces.
+
+    Vertices at one place (to 1 um) with equal weights are merged.
+    """
     count = sum(len(b[0]) for b in bodies)
     if count * joints * 8 > LARGEST:
         raise InputError("a smaller body expected", file=file, field="skin", value=f"{count} vertices, {joints} joints")
@@ -275,7 +289,7 @@ def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarr
     x = np.concatenate([b[0] for b in bodies])
     faces = np.concatenate([b[1] + s for b, s in zip(bodies, starts, strict=True)])
     weights = np.zeros((count, joints))
-    for start, (_, _, owners, own) in zip(starts, bodies, strict=True):
+    for start, (_, _, owners, own, _) in zip(starts, bodies, strict=True):
         np.add.at(weights, (start + np.arange(len(own))[:, None], owners), np.maximum(own, 0))
     weights /= weights.sum(axis=1, keepdims=True)
     key = np.concatenate([np.round(x * 1e6), np.round(weights * 1e4)], axis=1)
@@ -284,7 +298,8 @@ def _joined(file: Path, bodies: list, joints: int) -> tuple[np.ndarray, np.ndarr
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     if not whole.any():
         raise InputError("triangles expected", file=file, field="skin", value="none", mend="export the character's mesh")
-    return x[kept], faces[whole].astype(np.int32), weights[kept]
+    uv = together([b[4] for b in bodies])
+    return x[kept], faces[whole].astype(np.int32), weights[kept], None if uv is None else uv[whole]
 
 
 def _all_binds(joints: list[int], parents: np.ndarray, rest: np.ndarray, binds: dict[int, np.ndarray]) -> np.ndarray:

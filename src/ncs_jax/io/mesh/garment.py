@@ -39,10 +39,11 @@ def read_garment(
 ) -> GarmentRecord:
     """Read a garment in its rest shape on the resting body, in metres and Y up.
 
-    .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2), vertex sets `group_NAME` and skinning weights
-    `blend_weights` (V, J) for the body's joints. A skinned garment of a .glb or .fbx brings the weights of its own joints.
-    Vertices keep the file's order and number, but for .stl and glTF, which store a vertex many times: there, vertices at
-    exactly one place are merged, in order of first appearance. Polygons become triangles that do not fold, see `triangulate`.
+    .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2) of vertices or (F, 3, 2) of corners, vertex sets
+    `group_NAME`, and skinning weights `blend_weights` (V, J) for the body's joints. A skinned garment of a .glb or .fbx brings
+    the weights of its own joints. Vertices keep the file's order and number, but for .stl and glTF, which store a vertex many
+    times: there, vertices at exactly one place are merged, in order of first appearance. Polygons become triangles that do not
+    fold, see `triangulate`.
 
     Args:
         path: the file, or ncs:NAME. scale: metres a unit of the file; 0: as the file says, else 1 (USD and FBX say it, glTF is
@@ -58,7 +59,7 @@ def read_garment(
     raw = _raw(resolved(path), (mesh,) if isinstance(mesh, str) else tuple(mesh))
     file, verts = raw.file, len(raw.vertices)
     x = floats(file, "vertices", raw.vertices, ("V", 3), ("vertex",))
-    faces = indices(file, "faces", raw.faces, ("F", 3), verts, "vertices")
+    faces = corners = indices(file, "faces", raw.faces, ("F", 3), verts, "vertices")
     unit, axis = scale or raw.unit, up or raw.up
     x = floats(file, "vertices", upright(x, unit, axis), ("V", 3), ("vertex",))
     kept = number = np.arange(verts)
@@ -67,9 +68,10 @@ def read_garment(
         x, faces = x[kept], number[faces].astype(np.int32)
     check_surface(file, faces, len(x))
     uv, weights = raw.uv, raw.weights
-    uv = None if uv is None else floats(file, "uv", uv, (verts, 2), ("vertex",))
-    if uv is not None:
-        uv = uv[kept] if np.array_equal(uv[kept][number], uv) else None
+    if uv is not None and uv.ndim == 2:  # of the vertices
+        uv = floats(file, "uv", uv, (verts, 2), ("vertex",))[corners]
+    elif uv is not None:
+        uv = floats(file, "uv", uv, (len(faces), 3, 2), ("face", "corner"))
     if weights is not None:
         weights = normalised_weights(file, WEIGHTS, floats(file, WEIGHTS, weights, (verts, "J"), ("vertex", "joint")))[kept]
     sets = {n: number[indices(file, GROUP + n, a, ("N",), verts, "vertices")] for n, a in raw.groups.items()}

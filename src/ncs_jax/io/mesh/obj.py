@@ -9,18 +9,19 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes, one_object
-from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.polygons import triangle_corners
 from ncs_jax.io.mesh.raw import RawGarment
+from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.tables.files import text_of
 
-__all__ = ["format_obj", "read_obj"]
+__all__ = ["format_obj", "obj_faces", "read_obj"]
 
 
 def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
     """Read an .obj: vertices, triangles and texture coordinates.
 
     Polygons are cut as `triangulate` says. Negative numbers count back from the last vertex. Normals, lines and points are
-    ignored. Texture coordinates are None where a vertex has none, or two that differ.
+    ignored. Texture coordinates are None where a corner has none.
 
     Args:
         path: the file. mesh: names of objects (`o`), groups (`g`) or materials (`usemtl`) to read, with their vertices alone.
@@ -54,8 +55,11 @@ def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         corner, count = corner[np.repeat(chosen, count)], count[chosen]
         used, corner[:, 0] = np.unique(corner[:, 0], return_inverse=True)
         x = x[used]
-    cut = triangulate(file, x, count, corner[:, 0])
-    return RawGarment(file, x, cut, _per_vertex(len(x), coordinates, corner))
+    vertex, coordinate = corner[triangle_corners(file, x, count, corner[:, 0])].reshape(-1, 3, 2).transpose(2, 0, 1)
+    none = int((coordinate < 0).any(axis=1).sum())
+    uv = np.array(coordinates, np.float64)[coordinate] if coordinates and not none else None
+    notes = (f"{none} triangles have no texture coordinates, so none are kept",) if coordinates and none else ()
+    return RawGarment(file, x, vertex.astype(np.int32), uv, notes=notes)
 
 
 def _chosen(file: Path, mesh: Sequence[str], labels: list, owner: np.ndarray, corner: np.ndarray) -> np.ndarray:
@@ -127,18 +131,18 @@ def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -
     return v, t
 
 
-def _per_vertex(count: int, coordinates: list[list[float]], corners: np.ndarray) -> np.ndarray | None:
-    """Return texture coordinates (V, 2) of corners (vertex, coordinate), None where a vertex has none or two that differ."""
-    v, t = corners.T
-    if not coordinates or not len(v) or (t < 0).any() or len(np.unique(v)) != count:
-        return None
-    table = np.array(coordinates, dtype=np.float64)
-    uv = np.empty((count, 2))
-    uv[v] = table[t]
-    return uv if np.array_equal(uv[v], table[t], equal_nan=True) else None
+def obj_faces(faces: np.ndarray, uv: np.ndarray | None) -> str:
+    """Return the lines of triangles (F, 3), and of their corners' texture coordinates (F, 3, 2), if any, as text of an .obj."""
+    if uv is None:
+        return ("f %d %d %d\n" * len(faces)) % tuple((faces.reshape(-1) + 1).tolist())
+    rows = np.asarray(uv, np.float64).reshape(-1, 2)
+    kept, number = distinct(rows)
+    corners = np.stack([faces.reshape(-1), number], axis=1) + 1
+    lines = ("vt %.9g %.9g\n" * len(kept)) % tuple(rows[kept].reshape(-1).tolist())
+    return lines + ("f %d/%d %d/%d %d/%d\n" * len(faces)) % tuple(corners.reshape(-1).tolist())
 
 
 def format_obj(vertices: np.ndarray, faces: str) -> str:
-    """Return one frame as the text of an .obj; `faces` is text already, because it is the same in every frame."""
+    """Return one frame as the text of an .obj; `faces` is text of `obj_faces`, because it is the same in every frame."""
     flat = np.asarray(vertices, dtype=np.float64).reshape(-1)
     return ("v %.9g %.9g %.9g\n" * len(vertices)) % tuple(flat.tolist()) + faces

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.polygons import triangle_corners
 from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import LARGEST, readable, reading
 from ncs_jax.io.tables.table import indices
@@ -55,12 +55,15 @@ def read_ply(path: str | Path) -> RawGarment:
         uv = None if pair is None else np.stack([points[n].astype(np.float64) for n in pair], axis=1)
         name = next((n for n in POLYGONS if n in polygons), None)
         if name is None:
-            return RawGarment(file, x, np.zeros((0, 3), np.int32), uv)
+            return RawGarment(file, x, np.zeros((0, 3), np.int32))
         corners = polygons[name]
         if corners.dtype.kind == "f" and (np.abs(corners) < 2**31).all() and (corners == np.floor(corners)).all():
             corners = corners.astype(np.int64)  # a text file does not say that they are whole numbers
         corners = indices(file, f"face.{name}", corners, ("N",), len(x), "vertices")
-        return RawGarment(file, x, triangulate(file, x, lengths["face"], corners), uv)
+        cut = triangle_corners(file, x, lengths["face"], corners)
+        own = polygons.get("texcoord", np.zeros(0))  # of each polygon's corners, as MeshLab writes them
+        uv = own.astype(np.float64).reshape(-1, 2) if len(own) == 2 * len(corners) > 0 else None if uv is None else uv[corners]
+        return RawGarment(file, x, corners[cut].astype(np.int32), None if uv is None else uv[cut])
 
 
 def _header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:

@@ -9,14 +9,21 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["triangulate"]
+__all__ = ["triangle_corners", "triangulate"]
 
 FOLDED = 0.1  # of the area of a polygon that crosses itself may be folded; more is refused
 SLIVER = 0.03  # of its length squared too, for what is so slim that its area says little
 
 
 def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarray, skip: Collection[int] = ()) -> np.ndarray:
-    """Cut polygons into triangles (F, 3) int32, in their order and each facing as its polygon does.
+    """Cut polygons into triangles (F, 3) int32 of vertices, see `triangle_corners`."""
+    return np.asarray(corners)[triangle_corners(file, x, counts, corners, skip)].astype(np.int32)
+
+
+def triangle_corners(
+    file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarray, skip: Collection[int] = ()
+) -> np.ndarray:
+    """Cut polygons into triangles (F, 3) of places in `corners`, in the polygons' order and each facing as its polygon does.
 
     A polygon is cut by a fan from its first corner, if every triangle of the fan faces as the polygon's normal (Newell's); else
     by one from its second corner; else ear by ear, seen along the normal. A polygon of no area is cut by a fan. Corners that
@@ -42,37 +49,38 @@ def triangulate(file: Path, x: np.ndarray, counts: np.ndarray, corners: np.ndarr
         )  # fmt: skip
     kept = np.ones(len(counts), bool)
     kept[[i for i in skip if 0 <= i < len(counts)]] = False
-    counts, corners = _without_repeats(counts, np.asarray(corners))
+    corners = np.asarray(corners)
+    counts, left = _without_repeats(counts, corners)
     kept &= counts > 2
     starts = np.cumsum(counts, dtype=np.int64) - counts
     first = np.cumsum(np.where(kept, counts - 2, 0), dtype=np.int64) - np.where(kept, counts - 2, 0)
-    triangles = np.empty((int(np.where(kept, counts - 2, 0).sum()), 3), np.int32)
+    triangles = np.empty((int(np.where(kept, counts - 2, 0).sum()), 3), np.int64)
     for n in np.unique(counts[kept]):
         number = np.flatnonzero(kept & (counts == n))
-        polygons = corners[starts[number, None] + np.arange(n)]
-        triangles[first[number, None] + np.arange(n - 2)] = _equal(file, x, polygons, number)
+        polygons = left[starts[number, None] + np.arange(n)]
+        triangles[first[number, None] + np.arange(n - 2)] = _equal(file, x, corners, polygons, number)
     return triangles
 
 
 def _without_repeats(counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return polygons of four corners or more without the corners that repeat the one before; the first follows the last."""
+    """Return the counts of polygons, and the places of the corners that are left: in those of four corners or more, no corner
+    repeats the one before; the first follows the last.
+    """
     stops = np.cumsum(counts, dtype=np.int64)
     before = np.roll(corners, 1)
     before[stops - counts] = corners[stops - 1]
     same = (before == corners) & np.repeat(counts > 3, counts)
-    if not same.any():
-        return counts, corners
     owner = np.repeat(np.arange(len(counts)), counts)
-    return counts - np.bincount(owner[same], minlength=len(counts)), corners[~same]
+    return counts - np.bincount(owner[same], minlength=len(counts)), np.flatnonzero(~same)
 
 
-def _equal(file: Path, x: np.ndarray, polygons: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Cut polygons (P, n) of equally many corners into triangles (P, n - 2, 3); their numbers are for an error."""
+def _equal(file: Path, x: np.ndarray, corners: np.ndarray, polygons: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Cut polygons (P, n) of equally many corners' places into triangles (P, n - 2, 3); their numbers are for an error."""
     n = polygons.shape[1]
     fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
     if n == 3:
         return polygons[:, fan]
-    places = x[polygons]
+    places = x[corners[polygons]]
     with np.errstate(all="ignore"):  # numbers that are not finite are reported later
         places = places - places[:, :1]
         normal = np.cross(places, np.roll(places, -1, axis=1)).sum(axis=1)  # twice the area

@@ -15,10 +15,10 @@ class RawGarment:
     """What a reader finds in a file; nothing is checked yet.
 
     Attributes:
-        file: the path. vertices: (V, 3) in the file's unit. faces: (F, 3). uv: (V, 2) or None. unit: metres a unit, and up: the
-            axis that is up, as the file says. splits: whether the format stores a vertex once for each triangle, texture
-            coordinate or normal. groups: vertex sets by name. weights: (V, J) of the joints `joint_names`, or None. notes: what
-            was mended.
+        file: the path. vertices: (V, 3) in the file's unit. faces: (F, 3). uv: (F, 3, 2) of corners, (V, 2), or None. unit:
+            metres a unit, and up: the axis that is up, as the file says. splits: whether the format stores a vertex once for
+            each triangle, texture coordinate or normal. groups: vertex sets by name. weights: (V, J) of the joints
+            `joint_names`, or None. notes: what was mended.
     """
 
     file: Path

@@ -18,7 +18,7 @@ from ncs_jax.io.mesh import usd_arrays
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes, one_object
-from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.mesh.polygons import triangle_corners
 from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import LARGEST, readable, reading, replacing
 from ncs_jax.io.tables.table import floats, indices
@@ -47,8 +47,8 @@ def read_usd_mesh(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
     chosen = chosen_meshes(file, "garment.mesh", mesh, named)
     if not mesh:
         one_object(file, "garment.mesh", named)
-    x, faces = _joined(file, table, np.flatnonzero(chosen).tolist())
-    return RawGarment(file, x[0], faces, unit=float(table["scale"]), up=str(table["up"]))
+    x, faces, uv = _joined(file, table, np.flatnonzero(chosen).tolist())
+    return RawGarment(file, x[0], faces, uv, unit=float(table["scale"]), up=str(table["up"]))
 
 
 def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, float]:
@@ -60,7 +60,7 @@ def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, 
             "points with time samples in even steps expected", file=file, field="points", value=table["times"][:4].tolist(),
             mend="export the animation with a sample in every frame",
         )  # fmt: skip
-    x, faces = _joined(file, table, range(sum(key.endswith(".points") for key in table)))
+    x, faces, _ = _joined(file, table, range(sum(key.endswith(".points") for key in table)))
     rate = float(table["rate"]) / (steps[0] if len(steps) else 1.0)
     return file, upright(x, float(table["scale"]), str(table["up"])), faces, rate
 
@@ -93,22 +93,26 @@ def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
     return file, found
 
 
-def _joined(file: Path, table: dict[str, np.ndarray], meshes: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (T, V, 3) in the world and triangles (F, 3) of some meshes."""
-    parts, faces, start = [], [], 0
+def _joined(
+    file: Path, table: dict[str, np.ndarray], meshes: Iterable[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return positions (T, V, 3) in the world, triangles (F, 3) and texture coordinates (F, 3, 2), if any, of some meshes."""
+    parts, faces, maps, start = [], [], [], 0
     for i in meshes:
         name, turn = str(table[f"{i}.name"]), table[f"{i}.turn"]
         x = floats(file, f"{name}.points", table[f"{i}.points"], ("T", "V", 3), ("frame", "vertex"))
         if not np.array_equal(turn, np.broadcast_to(np.eye(4), turn.shape)):
             x = np.einsum("tvi,tij->tvj", x.astype(np.float64), turn[:, :3, :3]) + turn[:, None, 3, :3]
         corners = indices(file, f"{name}.faceVertexIndices", table[f"{i}.corners"], ("N",), x.shape[1], "points")
-        triangles = triangulate(file, x[0], table[f"{i}.counts"], corners, skip=table[f"{i}.holes"])
+        cut = triangle_corners(file, x[0], table[f"{i}.counts"], corners, skip=table[f"{i}.holes"])
         if table[f"{i}.left"] != (np.linalg.det(turn[0, :3, :3]) < 0):
-            triangles = triangles[:, ::-1]
+            cut = cut[:, ::-1]
         parts.append(x)
-        faces.append(triangles + start)
+        faces.append(corners[cut].astype(np.int32) + start)
+        maps.append(table[f"{i}.uv"][cut] if len(table[f"{i}.uv"]) else None)
         start += x.shape[1]
-    return np.concatenate(parts, axis=1), np.concatenate(faces)
+    uv = np.concatenate([m for m in maps if m is not None]) if all(m is not None for m in maps) else None
+    return np.concatenate(parts, axis=1), np.concatenate(faces), uv
 
 
 def _installed(file: Path) -> None:
@@ -121,7 +125,9 @@ def _installed(file: Path) -> None:
 # --- out --------------------------------------------------------------------------------------------------------------------
 
 
-def write_usd(path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray) -> None:
+def write_usd(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray, uv: np.ndarray | None = None
+) -> None:
     """Write a moving mesh, /garment, in metres and Y up; the file appears whole or not at all.
 
     `points`, `normals` and `extent` have a time sample a frame, at 0, 1, 2 ..., with fps time codes a second; the default value
@@ -129,6 +135,7 @@ def write_usd(path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: fl
 
     Args:
         path: where to. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second. rest: (V, 3) m.
+        uv: (F, 3, 2) texture coordinates of corners, which become the primvar `st`.
     """
     file = Path(path)
     _installed(file)
@@ -138,7 +145,7 @@ def write_usd(path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: fl
 
         inner = Path(folder) / f"{file.stem}{'.usdc' if suffix == '.usdz' else suffix}"
         stage = Usd.Stage.CreateNew(str(inner))
-        _fill(stage, vertices, faces, fps, rest)
+        _fill(stage, vertices, faces, fps, rest, uv)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
@@ -163,8 +170,8 @@ def _quietly() -> Iterator[None]:
         delegate.TakeUncoalescedDiagnostics()
 
 
-def _fill(stage, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray) -> None:
-    from pxr import Gf, Usd, UsdGeom, Vt
+def _fill(stage, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray, uv: np.ndarray | None) -> None:
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -180,6 +187,9 @@ def _fill(stage, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.n
     mesh.CreateDoubleSidedAttr(True)
     mesh.CreateDisplayColorAttr([Gf.Vec3f(0.32, 0.47, 0.65)])
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    if uv is not None:
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+        primvar.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv.reshape(-1, 2), np.float32)))
     points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
     for when, x in [(Usd.TimeCode.Default(), rest), *((Usd.TimeCode(t), x) for t, x in enumerate(vertices))]:
         x = np.ascontiguousarray(x, np.float32)

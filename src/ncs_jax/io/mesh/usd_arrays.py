@@ -14,7 +14,8 @@ def arrays_of(path: str, moving: bool) -> dict[str, np.ndarray]:
     """Return a stage's arrays by name: `scale`, `up`, `rate` and `times`, and those of each mesh i.
 
     These are `i.name`, `i.points` (times, V, 3), `i.turn` (times, 4, 4), which takes points, as rows, into the world,
-    `i.counts`, `i.corners`, `i.holes`, and `i.left`, whether the mesh is left-handed. A stage that is read as still has one
+    `i.counts`, `i.corners`, `i.holes`, `i.uv`, the corners' texture coordinates or no rows, and `i.left`, whether the mesh is
+    left-handed. A stage that is read as still has one
     time: the default one, or the first time sample of a mesh that has only samples.
     """
     from pxr import Usd, UsdGeom
@@ -49,8 +50,26 @@ def arrays_of(path: str, moving: bool) -> dict[str, np.ndarray]:
         found[f"{i}.turn"] = np.array([np.array(mesh.ComputeLocalToWorldTransform(when)) for when in whens]).reshape(-1, 4, 4)
         found |= {f"{i}.{key}": np.asarray(value, np.int32) for key, value in values.items()}
         found[f"{i}.holes"] = np.asarray(mesh.GetHoleIndicesAttr().Get(still) or (), np.int32)
+        found[f"{i}.uv"] = _corner_uv(mesh, still, found[f"{i}.corners"])
         found[f"{i}.left"] = np.array(mesh.GetOrientationAttr().Get(still) == "leftHanded")
     return found
+
+
+def _corner_uv(mesh, still, corners: np.ndarray) -> np.ndarray:
+    """Return the texture coordinates of corners: the primvar `st`, else the first of that role; no rows where there is none."""
+    from pxr import UsdGeom
+
+    variables = UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithValues()
+    maps = [v for v in variables if str(v.GetTypeName()) in ("texCoord2f[]", "texCoord2d[]", "texCoord2h[]")]
+    maps = [v for v in variables if v.GetPrimvarName() == "st"] or maps
+    values = np.asarray(maps[0].ComputeFlattened(still) if maps else (), np.float64)
+    if values.ndim == 2 and values.shape[1] == 2:
+        kind = maps[0].GetInterpolation()
+        if kind in ("vertex", "varying") and len(values) > corners.max(initial=-1) and corners.min(initial=0) >= 0:
+            return values[corners]
+        if kind == "faceVarying" and len(values) == len(corners):
+            return values
+    return np.zeros((0, 2))
 
 
 def _main(path: str, out: str, moving: str, memory: str) -> None:
