@@ -51,7 +51,7 @@ def animate(options) -> int:
     from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs.run import load_run
 
-    animation_suffix(options.out)  # before the run is read
+    suffix = animation_suffix(options.out, with_body=options.body)  # before the run is read
     run = load_run(options.folder)
     motions = (options.motion,) if options.motion else run.assembly.scene.motions
     if not motions:
@@ -71,6 +71,8 @@ def animate(options) -> int:
     fps = run.assembly.model.fps
     io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, uv=garment.uv, worn_by=worn_by)
     print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
+    if suffix in (".pc2", ".mdd"):
+        print(arguments.BLENDER)
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0

@@ -13,6 +13,7 @@ from pathlib import Path
 from ncs_jax.errors import InputError
 
 __all__ = [
+    "BLENDER",
     "FORMATS",
     "add_body",
     "body_of",
@@ -27,6 +28,10 @@ __all__ = [
     "whole",
 ]
 
+BLENDER = (
+    "  in Blender's Mesh Cache: Forward Z, Up -Y (on an object that is turned by 90 degrees about X, as an .obj's import does: "
+    "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
+)
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
 

@@ -36,7 +36,7 @@ def simulate(options) -> int:
     from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs import simulate as runs_simulate
 
-    animation_suffix(options.out)  # before hours are spent on frames that cannot be written
+    suffix = animation_suffix(options.out)  # before hours are spent on frames that cannot be written
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
     with WorkProgress("reading the scene") as progress:
 
@@ -52,6 +52,8 @@ def simulate(options) -> int:
     io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices, uv=garment.uv)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
+    if suffix in (".pc2", ".mdd"):
+        print(arguments.BLENDER)
     precision = "double" if result.vertices.dtype == np.float64 else "single"
     print(
         f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g, "

@@ -13,7 +13,7 @@ from ncs_jax.io.animation.glb import write_glb
 from ncs_jax.io.animation.mdd import read_mdd, write_mdd
 from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
-from ncs_jax.io.mesh.usd import USD, read_usd_animation, write_usd
+from ncs_jax.io.mesh.usd import USD, check_installed, read_usd_animation, write_usd
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
@@ -54,9 +54,7 @@ def write_animation(
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
             file cannot be written.
     """
-    file, suffix = Path(path), animation_suffix(path)
-    if worn_by is not None and suffix != ".glb":
-        raise InputError(".glb expected, as no other format here holds a body", file=file, value=suffix or "a folder")
+    file, suffix = Path(path), animation_suffix(path, with_body=worn_by is not None)
     x = floats(file, "vertices", np.asarray(vertices), ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
     triangles = indices(file, "faces", np.asarray(faces), ("F", 3), x.shape[1], "vertices")
     if 0 in x.shape:
@@ -81,11 +79,12 @@ def write_animation(
         _write_folder(file, x, obj_faces(triangles, maps), float(fps))
 
 
-def animation_suffix(path: str | Path) -> str:
-    """Return the suffix of a file that an animation can be written to, or nothing for a folder.
+def animation_suffix(path: str | Path, *, with_body: bool = False) -> str:
+    """Return the suffix of a file that an animation, perhaps with a body, can be written to, or nothing for a folder.
 
     Raises:
-        InputError: no such format is written, or a folder stands where the file shall be.
+        InputError: no such format is written or it holds no body, a package for it is not there, or a folder stands where the
+            file shall be.
     """
     file = Path(path)
     suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
@@ -93,6 +92,13 @@ def animation_suffix(path: str | Path) -> str:
         raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
     if suffix and file.expanduser().is_dir():
         raise InputError("a file expected", file=file, value="a folder", mend="give another name")
+    if with_body and suffix != ".glb":
+        mend = "end the name in .glb, or leave the body out"
+        raise InputError(
+            ".glb expected, as no other format here holds a body", file=file, value=suffix or "a folder", mend=mend
+        )
+    if suffix in USD:
+        check_installed(file)
     return suffix
 
 

@@ -23,7 +23,7 @@ from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.tables.files import LARGEST, readable, reading, replacing
 from ncs_jax.io.tables.table import floats, indices
 
-__all__ = ["USD", "read_usd_animation", "read_usd_mesh", "write_usd"]
+__all__ = ["USD", "check_installed", "read_usd_animation", "read_usd_mesh", "write_usd"]
 
 USD = (".usd", ".usdc", ".usda", ".usdz")
 
@@ -68,7 +68,7 @@ def read_usd_animation(path: str | Path) -> tuple[Path, np.ndarray, np.ndarray, 
 def _arrays(path: str | Path, kind: str) -> tuple[Path, dict[str, np.ndarray]]:
     """Return what the program `usd_arrays` finds; it is stopped where the file makes it take too much memory or time."""
     file = readable(path)
-    _installed(file)
+    check_installed(file)
     size = file.stat().st_size
     memory, seconds = min(2 * 2**30 + 64 * size, 3 * LARGEST), 60 + size // 10**6
     with reading(file, "USD"), tempfile.TemporaryDirectory() as folder:
@@ -115,7 +115,8 @@ def _joined(
     return np.concatenate(parts, axis=1), np.concatenate(faces), uv
 
 
-def _installed(file: Path) -> None:
+def check_installed(file: Path) -> None:
+    """Raise an InputError where the package for USD is not there."""
     if find_spec("pxr") is None:
         raise InputError(
             "the package usd-core is needed for USD", file=file, mend="pip install usd-core, or take another format"
@@ -138,7 +139,7 @@ def write_usd(
         uv: (F, 3, 2) texture coordinates of corners, which become the primvar `st`.
     """
     file = Path(path)
-    _installed(file)
+    check_installed(file)
     suffix = file.suffix.lower()
     with replacing(file) as part, _quietly(), tempfile.TemporaryDirectory(dir=part.parent, prefix=part.name) as folder:
         from pxr import Usd, UsdUtils
