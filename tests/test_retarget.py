@@ -413,8 +413,8 @@ def test_a_bvh_drives_the_packaged_body_and_check_says_how(tmp_path, rng, capsys
     assert main(["check", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "check.png")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert (
-        "run.bvh: 30 frames at 30 per second retargeted by joint names, 18 of the body's 31 joints are driven: Hips by hip"
-        in said
+        "run.bvh: 30 frames at 30 per second retargeted by joint names, 18 of the body's 31 joints are driven, of these by one "
+        "of another name: Hips by hip" in said
     )
     assert "LeftLeg by lShin" in said and "LeftFoot by lFoot" in said and "RightHand by" not in said
     assert "it seems to be in cm" in said and "drive nothing: rHand" in said and "lowest sole" in said

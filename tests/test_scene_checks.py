@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from ncs_jax.cli import main
+from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.scene_checks import RANGES, find_risks
-from ncs_jax.prepare.speed_checks import frames_named, thrown
+from ncs_jax.prepare.speed_checks import frames_named, good_stretches, thrown
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
 
@@ -138,6 +140,24 @@ def test_frames_are_named_once_a_stretch_the_worst_first():
     assert frames_named(size, 0.5) == "frame 20, also 0, 9" and frames_named(size, 2.5) == "frame 21"
     size[30::5] = 1
     assert frames_named(size, 0.5) == "frame 20, also 0, 9, 30, 35, 40 and 3 more"
+
+
+def test_good_stretches_are_those_of_the_file(tmp_path, plain_jax):
+    """As a scene names them: in the file's frames, of which every fourth is used here, without what is below a second."""
+    bad = np.zeros(240, bool)
+    bad[[78, 79, 100]] = True
+    still = np.zeros((240, 1, 3)), np.zeros((240, 3)), 30.0
+    assert good_stretches("a.bvh[8:]", MotionRecord(*still, origin=(8, 4.0)), bad) == ["a.bvh[8:317]", "a.bvh[412:965]"]
+    assert good_stretches("a.bvh", MotionRecord(*still, origin=(-240, 1.0)), bad) == ["a.bvh[-240:-162]", "a.bvh[-139:]"]
+    motion = {"poses": np.zeros((400, 2, 3)), "trans": np.zeros((400, 3)), "fps": np.array(60.0)}
+    motion["trans"][160:, 0] = 0.5
+    path = write_scene(tmp_path, SOUND.replace("swing.npz", "swing.npz[40:]"))
+    np.savez(tmp_path / "swing.npz", **motion)
+    risks = find_risks(assemble(load_scene(path)))
+    (mend,) = (risk.mend for risk in risks if risk.what == "jump within a frame")
+    for stretch in mend.split("of it: ")[1].split(", "):
+        path.write_text(path.read_text().replace(re.search(r"swing\.npz\[[^\]]*\]", path.read_text())[0], stretch))
+        assert not any(risk.what == "jump within a frame" for risk in find_risks(assemble(load_scene(path))))
 
 
 @pytest.mark.parametrize("fps", [30, 120])

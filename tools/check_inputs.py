@@ -108,12 +108,7 @@ def posed(body: BodyRecord, motion: MotionRecord) -> Driven:
             places[:, j] = body.joints[j] + motion.translation
         else:
             places[:, j] = places[:, parent] + turns[:, parent] @ (body.joints[j] - body.joints[parent])
-    told = next((n for n in motion.notes if "joints are driven" in n), ":").split(": ", 1)[1:]
-    by = {}
-    for pair in re.split(r", | and (?=\d)", told[0] if told else ""):
-        ours, _, theirs = pair.partition(" by ")
-        by[ours] = theirs or ours
-    return Driven(turns, places, by, motion.notes)
+    return Driven(turns, places, motion.driven, motion.notes)
 
 
 def apart(one: Driven, other: Driven, names: tuple[str, ...]) -> tuple[float, str, float, str]:

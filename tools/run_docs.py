@@ -206,12 +206,17 @@ def _python_fault(text: str) -> str:
     return ""
 
 
+HOSTS = ("bpy",)  # modules that are there in a host alone, such as Blender
+
+
 def _imported(tree: ast.Module) -> dict[str, object]:
     """Return what the imports of a block bring, by the names that they give it."""
     known: dict[str, object] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
+                if alias.name in HOSTS:
+                    continue
                 module, top = importlib.import_module(alias.name), alias.name.split(".")[0]
                 known[alias.asname or top] = module if alias.asname else sys.modules[top]
         elif isinstance(node, ast.ImportFrom):

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
 from ncs_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from ncs_jax.io import MotionRecord
+    from ncs_jax.prepare.build import Assembly
 
 __all__ = ["add_commands", "animate", "export"]
 
@@ -56,11 +62,14 @@ def animate(options) -> int:
     motions = (options.motion,) if options.motion else run.assembly.scene.motions
     if not motions:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
-    worn_by = None
+    worn_by, motion = None, run.motion(motions[0])
+    run = replace(run, assembly=replace(run.assembly, motions={motions[0]: motion}))  # read once
+    if options.motion:
+        _tell_motion(run.assembly, motion)
     if options.body:
         if run.assembly.body is None:
             raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
-        worn_by = run.assembly.body, run.motion(motions[0])
+        worn_by = run.assembly.body, motion
     vertices, error = run.animate(motions[0], options.alpha), ""
     if options.rank or options.bfloat16:
         smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
@@ -76,6 +85,17 @@ def animate(options) -> int:
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0
+
+
+def _tell_motion(assembly: Assembly, motion: MotionRecord) -> None:
+    """Print how the one motion of an assembly drives the body, and what in it puts the animation at risk."""
+    from ncs_jax.cli.check import tell, tell_risk
+    from ncs_jax.prepare.scene_checks import motion_risks
+
+    for risk in motion_risks(assembly):
+        tell_risk(risk)
+    for number, note in enumerate(motion.notes):
+        tell("" if number else "motion", note)
 
 
 def export(options) -> int:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ncs_jax.prepare.scene_checks import Risk
     from ncs_jax.prepare.setting import Setting
 
-__all__ = ["add_commands", "check"]
+__all__ = ["add_commands", "check", "tell", "tell_risk"]
 
 DRAWN = 4  # motions in the picture, at most
 NAMED = 6  # motions of a group that are named, at most
@@ -55,13 +55,13 @@ def check(options) -> int:
     drawn = _draw(options.out, setting, _worst_first(groups, setting, risks))
     print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
     for risk in risks:
-        _tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
+        tell_risk(risk)
     if not risks:
-        _tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
+        tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
     _tell_scene(setting, automatic=scene.network.cell == "auto")
     _tell_motions(setting, groups)
     if drawn:
-        _tell("picture", drawn)
+        tell("picture", drawn)
     return 0
 
 
@@ -70,7 +70,13 @@ def _say(words: str) -> None:
     print(f"{words} ...", file=sys.stderr, flush=True)
 
 
-def _tell(label: str, text: str) -> None:
+def tell_risk(risk: Risk) -> None:
+    """Print a risk."""
+    tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
+
+
+def tell(label: str, text: str) -> None:
+    """Print a line under a label, wrapped."""
     print(textwrap.fill(text, 128, initial_indent=f"  {label:10}", subsequent_indent=14 * " ", break_on_hyphens=False))
 
 
@@ -87,27 +93,32 @@ def _tell_scene(setting: Setting, *, automatic: bool) -> None:
     on = [name for name in NAMES if getattr(terms, name, None)] + [term.__name__ for term in terms.own]
     mass = float((mesh.vertex_area * model.material.density).sum())
     size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
-    _tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
+    tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
     record = setting.garment
     parts = summarise_surface(record.vertices, record.faces)
     counts = f"connected components {parts.components}, boundary loops (holes) {parts.loops}"
-    _tell("surface", f"{counts}, degenerate triangles {parts.degenerate}")
+    tell("surface", f"{counts}, degenerate triangles {parts.degenerate}")
     kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
-    _tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
+    tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if setting.body is not None and model.body is not None:
-        _tell("body", f"{len(setting.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
+        tell("body", f"{len(setting.body.vertices)} vertices, of which {model.body.shape[0]} can be touched")
     if setting.prepared.betas.size:
-        _tell("shape", f"betas {', '.join(f'{b:.3g}' for b in setting.prepared.betas)}")
+        tell("shape", f"betas {', '.join(f'{b:.3g}' for b in setting.prepared.betas)}")
     for note in (*(() if setting.body is None else setting.body.notes), *record.notes):
-        _tell("note", note)
+        tell("note", note)
     for name, layer in zip(setting.scene.garment.over, model.under, strict=False):
-        _tell("over", f"{name}: {len(layer.rest)} vertices")
-    _tell("joints", listed(joints, {name: name for name in joints}))
+        tell("over", f"{name}: {len(layer.rest)} vertices")
+    tell("joints", listed(joints, {name: name for name in joints}))
     if len(model.garment.pins):
-        _tell("pins", f"{len(model.garment.pins)} vertices of the group {setting.scene.garment.pins}")
-    _tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
+        tell("pins", f"{len(model.garment.pins)} vertices of the group {setting.scene.garment.pins}")
+    tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
+    network = setting.scene.network
+    swings = network.method == "ncs" and network.cell == "swing" and terms.inertia
+    if past := [name for name in ("inertia", "friction") if name in on and (swings or network.method == "pbns")]:
+        hold = ": the swing itself has inertia, and hold ties the cloth to it" if swings else ": it trains on poses alone"
+        tell("", f"training and log.csv have {'hold' if swings else 'nothing'} in the place of {' and '.join(past)}{hold}")
     if setting.scene.network.method == "ncs" and terms.inertia:
-        _tell("cell", setting.scene.network.cell + (" (auto)" if automatic else ""))
+        tell("cell", setting.scene.network.cell + (" (auto)" if automatic else ""))
 
 
 def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:
@@ -125,22 +136,22 @@ def _tell_motions(setting: Setting, groups: Sequence[Sequence[str]]) -> None:
     told = [name for group in groups if len(group) > 1 for name in group]
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
         for name in names:
-            _tell(kind, f"{name}: {len(motions[name].poses)} frames at {setting.model.fps:g} per second")
+            tell(kind, f"{name}: {len(motions[name].poses)} frames at {setting.model.fps:g} per second")
             for note in () if name in told else motions[name].notes:
-                _tell("", note)
+                tell("", note)
             told.append(name)
     for group in groups:
         if len(group) == 1 or not motions[group[0]].notes:
             continue
         more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
-        _tell("alike", f"{len(group)} motions: {', '.join(group[:NAMED])}{more}")
+        tell("alike", f"{len(group)} motions: {', '.join(group[:NAMED])}{more}")
         shared = [note for note in motions[group[0]].notes if all(note in motions[name].notes for name in group)]
         for note in shared:
-            _tell("", note)
+            tell("", note)
         for name in group:
             for note in motions[name].notes:
                 if note not in shared:
-                    _tell("", f"{name}: {note}")
+                    tell("", f"{name}: {note}")
     if not setting.model.moves:
         print("  the character never moves: only the static network is trained")
 

@@ -74,7 +74,8 @@ def train(options) -> int:
         if options.preview:
             draw(run, options.out)
         given = shlex.join([options.scene, "--out", options.out])
-        _warn_of_few_steps(run, options.steps, f"ncs train {given} --resume --minutes M goes on")
+        own = f", with the scene that {options.out}/run.json keeps" if options.resume else ""
+        _warn_of_few_steps(run, options.steps, f"ncs train {given} --resume --minutes M goes on{own}")
     return 0
 
 
@@ -96,7 +97,7 @@ def _trained(scene, out, **chosen):
     from ncs_jax.runs import train as runs_train
 
     with _TrainingBar() as bar:
-        run = runs_train.train(scene, out, **chosen, report=bar.show)
+        run = runs_train.train(scene, out, **chosen, report=bar.show, say=bar.begin)
     if not bar.reports and jax.process_index() == 0:
         print(f"{out} has its {run.steps} steps already: nothing was trained; --steps N, or --minutes M, goes on")
     return run
@@ -117,7 +118,7 @@ class _TrainingBar:
     def __init__(self) -> None:
         import jax
 
-        self._progress = WorkProgress("reading the scene and compiling", quiet=jax.process_index() > 0)
+        self._progress = WorkProgress("reading the scene", quiet=jax.process_index() > 0)
         self._devices = jax.device_count()
         self._handler: Any = None
         self._stopped = False
@@ -140,6 +141,10 @@ class _TrainingBar:
         if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
             self._handler = None
+
+    def begin(self, doing: str) -> None:
+        """Say what is done before the first step."""
+        self._progress.begin(doing)
 
     def show(self, r: Report) -> None:
         """Show a report.

@@ -94,6 +94,8 @@ class MotionRecord:
             that points up, where the format says so, else "". notes: what was done so that the motion drives the body.
         source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
         bones: as in a body.
+        origin: the number in its file of the first frame, and how many of the file's frames make one of these.
+        driven: of a motion that was retargeted, the source's joint for each joint of the body that one drives.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
     """
 
@@ -110,6 +112,8 @@ class MotionRecord:
     source: SkeletonPoses | None = None
     bones: tuple[str, ...] = ()
     undriven: dict[str, str] = field(default_factory=dict)
+    origin: tuple[int, float] = (0, 1.0)
+    driven: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -200,6 +200,7 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         read = (
             partial(_frames, record) if chosen is None else lambda start, stop: io.read_motion(path, frame_range=(start, stop))
         )
+        count = len(record.poses)
         record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
     except InputError as error:
         if error.file is not None:
@@ -211,6 +212,7 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
             "a translation in metres expected", file=path, field="trans", value=f"{speed:.0f} m/s",
             mend="divide centimetres by 100, or write motion.scale = 0.01 into the scene file",
         )  # fmt: skip
+    first = (chosen[0] if chosen else 0) + count - len(record.poses)  # frames that only lead in are left out
     poses, translation = record.poses, record.translation
     if record.fps != scene.motion.fps:
         begin = translation[:1].astype(np.float64)
@@ -218,4 +220,5 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
             jnp.asarray(poses, jnp.float32), jnp.asarray(translation - begin, jnp.float32), float(record.fps), scene.motion.fps
         )
         translation = begin + np.asarray(moved)
-    return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=scene.motion.fps)
+    origin, fps = (first, float(record.fps) / scene.motion.fps), scene.motion.fps
+    return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=fps, origin=origin)

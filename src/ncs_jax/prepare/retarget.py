@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -142,7 +143,7 @@ def retarget(
     used = set(driven.values())
     still, unused = tuple(n for n in names if n not in driven), tuple(n for n in motion.joint_names if n not in used)
     lacking, shown = _lacking(motion, names, target, pairs), _shown(motion, scale * places @ upright.T)
-    moved = MotionRecord(local, translation, motion.fps, names, source=shown, undriven=lacking)
+    moved = MotionRecord(local, translation, motion.fps, names, source=shown, undriven=lacking, driven=driven)
     result = Retargeted(moved, driven, still, unused, scale)
     notes = [*_notes(result, motion.joint_names, source.shaped, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
@@ -305,6 +306,11 @@ def sole_heights(body: BodyRecord, target: Limbs, turns: np.ndarray, places: np.
     return heights.min(axis=1) - (points @ up).min()
 
 
+def _plain(name: str) -> str:
+    """Return a joint's name without its prefix (mixamorig:), capital letters and signs."""
+    return re.sub(r"[\W_]", "", name.rsplit(":", 1)[-1].lower())
+
+
 def _notes(
     result: Retargeted, theirs: tuple[str, ...], shaped: tuple[str, ...], leg: float, scaled_by: str, rise: float
 ) -> tuple[str, ...]:
@@ -312,8 +318,9 @@ def _notes(
     length of its legs in its own unit, `rise` in m.
     """
     ours = result.motion.joint_names
-    pairs = {o: o if o == t else f"{o} by {t}" for o, t in result.pairs.items()}
-    notes = [f"retargeted by joint names, {len(pairs)} of the body's {len(ours)} joints are driven: {listed(ours, pairs)}"]
+    unlike = {o: f"{o} by {t}" for o, t in result.pairs.items() if _plain(o) != _plain(t)}
+    told = f", of these by one of another name: {listed(ours, unlike)}" if unlike else ", each by the one of its name"
+    notes = [f"retargeted by joint names, {len(result.pairs)} of the body's {len(ours)} joints are driven{told}"]
     if shaped:
         notes.append(f"told by the shape of the motion's skeleton, as its names do not tell them: {', '.join(shaped)}")
     if result.still:

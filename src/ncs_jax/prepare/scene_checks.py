@@ -25,7 +25,7 @@ from ncs_jax.prepare.touchable import touchable_faces
 from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene
 
-__all__ = ["RANGES", "Risk", "find_risks"]
+__all__ = ["RANGES", "Risk", "find_risks", "motion_risks"]
 
 # quantity: (least, most) that is safe
 RANGES = {
@@ -198,17 +198,25 @@ def _postures(a: Setting) -> Iterator[Risk]:
             yield Risk(what, f"{value} of {name}", risk, mend)
 
 
-def find_risks(a: Setting) -> list[Risk]:
-    """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
+def motion_risks(a: Setting) -> list[Risk]:
+    """Return what puts a scene at risk in its motions themselves, whatever is worn."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
+    return [*found, *_postures(a)]
+
+
+def find_risks(a: Setting) -> list[Risk]:
+    """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
+    found = motion_risks(a)
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
         found += _shows(a, faces)
-    found += [*_postures(a), *_material(a.scene), *_grain(a), *_mesh(a)]
+    found += [*_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:
-        found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), "push it out: ncs fit")
+        below = "push it out of the garment below where it was made: ncs fit knows the body alone"
+        mend = below if a.model.under else "push it out: ncs fit"
+        found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), mend)
     for name in a.motions:
         found += _motion(a, faces, name)
     return found

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,34 +13,59 @@ from ncs_jax.geometry.skinning import Blend
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.posing import joint_transforms, world_axes
 from ncs_jax.prepare.setting import Setting
+from ncs_jax.scene.motion_names import split_frames
 
-__all__ = ["frames_named", "speed_faults", "thrown"]
+__all__ = ["frames_named", "good_stretches", "speed_faults", "thrown"]
 
 JUMP = 0.3  # m by which the root or skin may leave its path within a frame: the thickness of a limb
 TURN = 90.0  # degrees within a frame
 THROWN = 1.0  # of a garment's length, by which leaps and lunges throw it, and walks, runs and most dances (0.93) do not
 SEEN = 100  # points of the garment and of the body that are looked at
-NAMED = 5  # frames that are named
+NAMED = 5  # frames, and stretches, that are named
+
+
+class _Fault(NamedTuple):
+    """Frames (T,) that are at fault, and what a risk says: what, how much and where, what that does, and what mends it."""
+
+    frames: np.ndarray
+    words: tuple[str, str, str, str]
 
 
 def speed_faults(a: Setting, name: str) -> Iterator[tuple[str, str, str, str]]:
     """Yield what is too fast in a motion, how much and in which frames, what that does, and what mends it."""
     record = a.motions[name]
-    yield from _jumps(a, name, record)
-    yield from _turns(a, name, record)
+    faults = [fault for fault in (_jumps(a, name, record), _turns(a, name, record), _throws(a, name, record)) if fault]
+    good = good_stretches(name, record, np.any([fault.frames for fault in faults], axis=0)) if faults else ()
+    for fault in faults:
+        what, value, risk, mend = fault.words
+        yield what, value, risk, f"{mend}; good stretches of it: {', '.join(good)}" if good else mend
+
+
+def good_stretches(name: str, record: MotionRecord, bad: np.ndarray) -> list[str]:
+    """Return the longest stretches of a second or more without a bad frame (T,), in their order, as a scene names them."""
+    starts, stops = (np.flatnonzero(np.diff(np.concatenate([[True], bad, [True]]).astype(int)) == way) for way in (-1, 1))
+    long = [k for k in np.argsort(starts - stops, kind="stable")[:NAMED] if stops[k] - starts[k] >= record.fps]
+    file, (first, each) = split_frames(name)[0], record.origin
+    ends = [(first + ceil(starts[k] * each), first + int((stops[k] - 1) * each) + 1) for k in sorted(long)]
+    return [f"{file}[{start}:{'' if start < 0 <= stop else stop}]" for start, stop in ends]  # below 0 they count from the end
+
+
+def _throws(a: Setting, name: str, record: MotionRecord) -> _Fault | None:
+    """Return the fault where the garment is thrown farther than a swing's linear range."""
     scene = a.scene
     if a.body is None or not (scene.network.method == "ncs" and scene.network.cell == "swing" and scene.physics.inertia):
-        return
+        return None
     mesh, gravity = a.model.garment.mesh, np.array(scene.physics.gravity)
     rest, mass = np.asarray(mesh.rest, np.float64), np.asarray(mesh.vertex_area, np.float64)
     some = _some(len(rest))
     path = _paths(a, record, rest[some], a.model.blend, some)
     up = np.abs(gravity).argmax()
     far = thrown(path, mass[some], record.fps, gravity, float(np.ptp(rest[:, up])), scene.network.damping)
-    if far.max() > THROWN:
-        value = f"the garment thrown aside by {far.max():.2f} of its length in {name}, {frames_named(far, THROWN)}"
-        risk = "the swing is shortened to its linear range: it lags, and cloth is stretched"
-        yield "fast motion", value, risk, "slow or smooth the motion there, or leave the frames out: FILE[FIRST:STOP]"
+    if not far.max() > THROWN:
+        return None
+    value = f"the garment thrown aside by {far.max():.2f} of its length in {name}, {frames_named(far, THROWN, record.origin)}"
+    risk = "the swing is shortened to its linear range: it lags, and cloth is stretched"
+    return _Fault(far > THROWN, ("fast motion", value, risk, "slow or smooth the motion there, or leave the frames out"))
 
 
 def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
@@ -67,18 +94,21 @@ def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, 
     return far
 
 
-def frames_named(size: np.ndarray, limit: float) -> str:
-    """Return as words in which frames a size (frames,) is beyond its limit: where the worst stretch begins, then the others."""
+def frames_named(size: np.ndarray, limit: float, origin: tuple[int, float] = (0, 1.0)) -> str:
+    """Return as words in which frames a size (frames,) is beyond its limit: where the worst stretch begins, then the others.
+
+    `origin`: of the motion, so that they are the file's frames.
+    """
     bad = size > limit
     first = np.flatnonzero(bad & ~np.concatenate([[False], bad[:-1]]))
     worst = int(first[first <= size.argmax()][-1])
-    others = [str(frame) for frame in first if frame != worst]
+    others = [str(origin[0] + round(frame * origin[1])) for frame in first if frame != worst]
     more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-    return f"frame {worst}" + (f", also {', '.join(others[:NAMED])}{more}" if others else "")
+    return f"frame {origin[0] + round(worst * origin[1])}" + (f", also {', '.join(others[:NAMED])}{more}" if others else "")
 
 
-def _jumps(a: Setting, name: str, record: MotionRecord) -> Iterator[tuple[str, str, str, str]]:
-    """Yield a fault where the root, or skin that the garment can touch, leaves its straight path within a frame."""
+def _jumps(a: Setting, name: str, record: MotionRecord) -> _Fault | None:
+    """Return the fault where the root, or skin that the garment can touch, leaves its straight path within a frame."""
     path = record.translation.astype(np.float64)[:, None]
     if a.body is not None and a.model.body is not None:
         skin = np.asarray(a.model.body, np.float64)
@@ -88,28 +118,31 @@ def _jumps(a: Setting, name: str, record: MotionRecord) -> Iterator[tuple[str, s
         )
     begun = np.concatenate([path[:1], path[:1], path])
     away = np.linalg.norm(begun[2:] - 2 * begun[1:-1] + begun[:-2], axis=-1).max(axis=1)
-    if away.max() > JUMP:
-        value = f"{away.max():.2f} m in {name}, {frames_named(away, JUMP)}"
-        yield "jump within a frame", value, "the cloth is left behind, then torn along", "clean or cut the motion there"
+    if not away.max() > JUMP:
+        return None
+    value = f"{away.max():.2f} m in {name}, {frames_named(away, JUMP, record.origin)}"
+    risk = "the cloth is left behind, then torn along"
+    return _Fault(away > JUMP, ("jump within a frame", value, risk, "clean or cut the motion there"))
 
 
-def _turns(a: Setting, name: str, record: MotionRecord) -> Iterator[tuple[str, str, str, str]]:
-    """Yield a fault where a joint that carries the garment turns too far within a frame."""
+def _turns(a: Setting, name: str, record: MotionRecord) -> _Fault | None:
+    """Return the fault where a joint that carries the garment turns too far within a frame."""
     from scipy.spatial.transform import Rotation
 
     model = a.model
     axes = None if model.rest_rotations is None else np.asarray(model.rest_rotations, np.float64)
     local = world_axes(record.poses[:, list(model.source_joints)], axes)
     if len(local) < 2:
-        return
+        return None
     turns = np.matmul(local[1:], np.swapaxes(local[:-1], -1, -2))
     turn = np.degrees(Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()).reshape(turns.shape[:2])
-    if turn.max() > TURN:
-        number = model.source_joints[int(turn.max(axis=0).argmax())]
-        label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
-        at = frames_named(np.concatenate([[0], turn.max(axis=1)]), TURN)
-        value = f"{turn.max():.0f} degrees in {name}, {at}, joint {label}"
-        yield "turn within a frame", value, "a limb passes through cloth", "clean the motion there"
+    if not turn.max() > TURN:
+        return None
+    number = model.source_joints[int(turn.max(axis=0).argmax())]
+    label = a.body.joint_names[number] if a.body is not None and a.body.joint_names else str(number)
+    size = np.concatenate([[0], turn.max(axis=1)])
+    value = f"{turn.max():.0f} degrees in {name}, {frames_named(size, TURN, record.origin)}, joint {label}"
+    return _Fault(size > TURN, ("turn within a frame", value, "a limb passes through cloth", "clean or cut the motion there"))
 
 
 def _some(count: int) -> np.ndarray:

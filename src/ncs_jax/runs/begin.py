@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -36,20 +36,22 @@ def assemble_run(
     *,
     terms: Sequence[OwnTerm],
     network: NetworkMaker | None,
+    report: Callable[[str], None] | None = None,
 ) -> tuple[Assembly, dict | None]:
     """Make the scene of a run ready; return it, and the weights that it begins with where it begins with another run's.
 
     Args:
         scene: the run's. facts: of the run that is resumed, if any, in the folder `out`. start: a run to begin from, if any.
+        report: called with what is done next, see `run.assemble`.
 
     Raises:
         InputError: a file is unusable, or terms, network or the run to begin from do not fit.
     """
     if start is not None:
-        return _assemble_started(start, scene, terms, network)
+        return _assemble_started(start, scene, terms, network, report)
     if facts is not None and out is not None:
         check_own(facts, out, terms, network)
-    assembly = assemble(scene, terms=terms, network=network)
+    assembly = assemble(scene, terms=terms, network=network, report=report)
     if facts is not None and out is not None and facts.get("start"):  # of the run it began from: not found anew
         assembly = _with_fields_of(read_prepared(out), assembly)
     return assembly, None
@@ -123,7 +125,11 @@ def _differences(kept: dict, given: dict, where: str = "") -> Iterator[str]:
 
 
 def _assemble_started(
-    start: Run | str | Path, scene: Scene, terms: Sequence[OwnTerm], network: NetworkMaker | None
+    start: Run | str | Path,
+    scene: Scene,
+    terms: Sequence[OwnTerm],
+    network: NetworkMaker | None,
+    report: Callable[[str], None] | None,
 ) -> tuple[Assembly, dict]:
     """Make a scene ready for a network that another run has trained; return it and the weights.
 
@@ -143,7 +149,7 @@ def _assemble_started(
         _check_network(name, before.scene.network, scene)
     if not scene.body.joints:
         scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
-    assembly = assemble(scene, terms=terms, network=network)
+    assembly = assemble(scene, terms=terms, network=network, report=report)
     if not np.array_equal(before.garment.faces, assembly.garment.faces):
         size = f"{len(assembly.garment.vertices)} vertices, {len(assembly.garment.faces)} triangles"
         expected = f"the triangles of the garment of {name} expected, {len(before.garment.faces)}"

@@ -24,7 +24,7 @@ from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
-from ncs_jax.runs.run import NetworkMaker, Run, own_names
+from ncs_jax.runs.run import NetworkMaker, Run, load_run, own_names
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.training.batches import CHUNK, chunks
 from ncs_jax.training.devices import trim_memory
@@ -46,6 +46,7 @@ def train(
     resume: bool = False,
     start: Run | str | Path | None = None,
     report: Callable[[Report], None] | None = None,
+    say: Callable[[str], None] | None = None,
     terms: Sequence[OwnTerm] = (),
     network: NetworkMaker | None = None,
 ) -> Run:
@@ -61,6 +62,7 @@ def train(
             learning rate is that of a run of so many steps from its beginning.
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
         report: called after every chunk of steps; KeyboardInterrupt from it ends the run with a checkpoint of these steps.
+        say: called before the first step with what is done next, in words.
         terms: of one's own, see `energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step inputs, in
             J.
         network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
@@ -77,8 +79,12 @@ def train(
     facts = facts_of_run(out, resume)
     if out is not None and facts is not None:
         scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
-    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network)
+        if minutes is None and Checkpoints(out).latest() == (steps or facts["steps"]):  # nothing is left to train
+            return load_run(out, terms=terms, network=network)
+    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network, report=say)
     trim_memory()
+    if say is not None:
+        say("compiling")
     placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
@@ -115,7 +121,8 @@ def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int
             needed = math.ceil(costs.seconds(int(state.step), ENOUGH) / 60)
             upto = f", up to step {last}" if state.step else ""
             what = f"{minutes:g} minutes hold about {last - int(state.step)} steps on this machine{upto}: too few to learn from"
-            warnings.warn(f"{what}; {ENOUGH} steps take about {needed} minutes", InputWarning, stacklevel=3)
+            more = " more" if state.step else ""
+            warnings.warn(f"{what}; {ENOUGH} steps in all take about {needed} minutes{more}", InputWarning, stacklevel=3)
     if last != output.planned:
         output.plan(last)
     return last

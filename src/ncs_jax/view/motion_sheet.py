@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,12 +19,12 @@ from ncs_jax.errors import required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import side_and_rest
-from ncs_jax.prepare.posing import joint_transforms, skinned
+from ncs_jax.prepare.posing import carried, joint_transforms, skinned
 from ncs_jax.prepare.setting import Setting
 from ncs_jax.view.animation import upright
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
-from ncs_jax.view.pictures import BODY, CLOTH, CLOTH_INSIDE, FAINT, INK
+from ncs_jax.view.pictures import BODY, CLOTH, CLOTH_INSIDE, FAINT, INK, WORN
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 __all__ = ["motion_sheet", "posed"]
@@ -86,6 +86,7 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
         target = np.array([middle[0], (low + high) / 2, middle[2]])
         camera = Camera(target, tall, wide, azimuths[column], elevation=7.0)
         meshes = [DrawnMesh(skin[column], body.faces, BODY), DrawnMesh(cloth[column], garment.faces, CLOTH, CLOTH_INSIDE)]
+        meshes += [DrawnMesh(upright(x, up), faces, WORN) for x, faces in _worn_below(setting, matrices[column])]
         ground = Ground(floor, (float(middle[0]), float(middle[2])), 0.3 * tall, cell=0)
         place = (MARGIN + column * width, TITLE)
         image.paste(Image.fromarray(render(meshes, camera, TILE, ground=ground, samples=1)), place)
@@ -104,6 +105,13 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
         ImageDraw.Draw(label).text((height / 2, MARGIN / 2), words, 255, ImageFont.load_default(12), "mm")
         image.paste(FAINT, (0, TITLE + row * height), label.rotate(90, expand=True))
     return image
+
+
+def _worn_below(setting: Setting, matrices: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the vertices (V, 3) of each garment below, skinned to a pose, m, and its faces."""
+    for layer in setting.model.under:
+        own = matrices[list(layer.model.source_joints)]
+        yield carried(np.asarray(layer.rest, np.float64), layer.model.blend, own), np.asarray(layer.model.garment.mesh.faces)
 
 
 def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, floor: float) -> Image.Image:
