@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -377,7 +378,7 @@ def test_train_says_where_it_is(run_folder, tmp_path, capsys):
     assert main(["train", str(scene), "--out", str(tmp_path / "run")]) == 2
 
 
-def test_resume_drops_no_option(run_folder, tmp_path, capsys):
+def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
     scene, given = run_folder
     out = tmp_path / "run"
     shutil.copytree(given, out)
@@ -385,7 +386,9 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys):
     for option, word in (("--preset", "fast"), ("--seed", "7"), ("--steps", "5"), ("--from", str(given))):
         assert main([*line, option, word]) == 2
         one_line(capsys, [option.strip("-").replace("from", "start")])
-    assert main([*line, "--steps", "10"]) == 0
+    with monkeypatch.context() as patch:  # nothing is assembled anew, as its scene is there
+        patch.setattr("ncs_jax.runs.train.assemble_run", None)
+        assert main([*line, "--steps", "10"]) == 0
     assert f"{out} has its 10 steps already: nothing was trained" in capsys.readouterr().out
     assert main([*line, "--minutes", "0.001"]) == 0
     said = capsys.readouterr()
@@ -394,7 +397,9 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys):
     assert first.startswith(
         "ncs: warning: 0.001 minutes hold about 10 steps on this machine, up to step 20: too few to learn from"
     )
-    assert last.startswith("ncs: warning: only 20 steps fitted in") and "--resume --minutes M goes on" in last
+    assert re.search("300 steps in all take about [0-9]+ minutes more$", first)
+    assert last.startswith("ncs: warning: only 20 steps fitted in")
+    assert last.endswith(f"--resume --minutes M goes on, with the scene that {out}/run.json keeps")
     with pytest.raises(SystemExit):
         main([*line, "--minutes", "1", "--steps", "30"])
 
@@ -479,11 +484,40 @@ def test_progress_in_a_file_is_lines_as_time_goes_by(monkeypatch):
     assert lines[0] == "reading ..." and told == [1, 5, 9, 13, 17, 21, 24]
 
 
+def test_a_wait_is_told_with_its_seconds_until_something_is_shown(monkeypatch):
+    monkeypatch.setattr("ncs_jax.cli.progress.EVERY", 0.02)
+    console = Console(file=StringIO(), width=80)
+
+    def wait(line):
+        end = time.monotonic() + 5
+        while line not in console.file.getvalue() and time.monotonic() < end:
+            time.sleep(0.005)
+        return console.file.getvalue().splitlines()
+
+    with WorkProgress("reading", console=console) as progress:
+        assert wait("reading, 0:00")[:2] == ["reading ...", "reading, 0:00"]
+        progress.begin("compiling")
+        wait("compiling, 0:00")
+        progress.show("drawing", 0.25, 1.0)
+        shown = wait("drawing  25%")
+        time.sleep(0.1)
+        assert console.file.getvalue().splitlines() == shown
+    assert shown[-1] == "drawing  25%" and "compiling ..." in shown
+
+
+@pytest.mark.parametrize("name", ["a.pc2", "a.usdc", "frames"])
+def test_a_body_in_a_format_without_one_is_refused_before_the_run_is_read(run_folder, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.setattr("ncs_jax.runs.run.load_run", None)
+    assert main(["animate", str(run_folder[1]), "--body", "--out", str(tmp_path / name)]) == 2
+    one_line(capsys, [".glb expected", name])
+
+
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])
 def test_animate_in_every_format(run_folder, tmp_path, capsys, name):
     _, folder = run_folder
     assert main(["animate", str(folder), "--out", str(tmp_path / name), "--alpha", "1.5"]) == 0
-    assert "24 frames" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "24 frames" in said and ("Forward Z, Up -Y" in said) == (name in ("a.pc2", "a.mdd"))
     assert (tmp_path / name).exists()
     if name == "a.glb":
         assert (tmp_path / name).read_bytes()[:4] == b"glTF"
@@ -603,7 +637,13 @@ def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, 
     np.savez(tmp_path / "other.npz", **swing(frames=9))
     monkeypatch.chdir(tmp_path)
     assert main(["animate", str(folder), "--motion", "other.npz", "--out", "c.npz"]) == 0
-    assert "9 frames" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "9 frames" in said and "at risk" not in said
+    leap = swing(frames=9)
+    leap["trans"][4:, 0] = 0.7
+    np.savez(tmp_path / "leap.npz", **leap)
+    assert main(["animate", str(folder), "--motion", "leap.npz", "--out", "c.npz"]) == 0
+    assert "at risk   jump within a frame: 0.70 m in leap.npz, frame 4" in capsys.readouterr().out
     assert main(["animate", str(folder), "--motion", "other.npz[2:-1]", "--out", "c.npz"]) == 0
     assert "6 frames" in capsys.readouterr().out
     assert main(["animate", str(folder), "--motion", "nowhere.npz", "--out", "d.npz"]) == 2

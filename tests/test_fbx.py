@@ -379,10 +379,17 @@ def wardrobe(path: Path, writer, *, percent: float = 0.0) -> Path:
     quads = np.stack([corner, corner + 1, corner + 4, -1 - (corner + 3)], axis=1).astype(np.int32)
     edge = np.array([0, -2], np.int32)  # one that stands by itself
     place = fbx.properties(Lcl__Translation=(10, 0, 0), Lcl__Scaling=(-100, 100, 100))
+    ends = np.concatenate([quads.ravel(), edge])
+    uv = x[np.where(ends < 0, -1 - ends, ends), :2] + 10 * (np.arange(len(ends)) // 4)[:, None]  # a seam around each quad
+    order = np.random.default_rng(0).permutation(len(ends)).astype(np.int32)
     objects += [
         ("Model", [70, "Model::Skirt", "Mesh"], [place]),
         ("Geometry", [71, "Geometry::Skirt_mesh", "Mesh"], [
-            ("Vertices", [x.ravel()], None), ("PolygonVertexIndex", [np.concatenate([quads.ravel(), edge])], None),
+            ("Vertices", [x.ravel()], None), ("PolygonVertexIndex", [ends], None),
+            ("LayerElementUV", [0], [
+                ("MappingInformationType", ["ByPolygonVertex"], None), ("ReferenceInformationType", ["IndexToDirect"], None),
+                ("UV", [uv[np.argsort(order)].ravel()], None), ("UVIndex", [order], None),
+            ]),
         ]),
         ("Deformer", [80, "Deformer::", "BlendShape"], []),
         ("Deformer", [81, "SubDeformer::tall", "BlendShapeChannel"], [fbx.properties(DeformPercent=percent)]),
@@ -404,6 +411,8 @@ def test_meshes_blend_shapes_and_garments(tmp_path, writer):
         skirt = io.read_garment(path, mesh=[name])
         np.testing.assert_allclose(skirt.vertices, grid(4, 3)[0] * [-1, 1, 1] + [0.1, 0, 0], atol=1e-9)
         a, b, c = (skirt.vertices[skirt.faces[:, k]] for k in range(3))
+        seams = skirt.uv - 10 * (np.arange(12) // 2)[:, None, None]
+        np.testing.assert_allclose(seams, grid(4, 3)[0][skirt.faces, :2], atol=1e-12)
         assert len(skirt.faces) == 12 and (np.cross(b - a, c - a)[:, 2] > 0).all()
     body, tall = io.read_body(path), io.read_body(path, part=["Skin"], shapes={"tall": 0.5})
     moved = tall.vertices - body.vertices

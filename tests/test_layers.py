@@ -146,3 +146,23 @@ def test_a_garment_below_of_another_rate_or_body_is_refused(folder, worn):
         assemble(changed(body=dataclasses.replace(worn.scene.body, file="other.npz")))
     with pytest.raises(InputError, match=r"run\.json: no run there"):
         assemble(changed(garment=dataclasses.replace(worn.scene.garment, over=("gone",))))
+
+
+def test_check_draws_the_garment_below_and_sends_nobody_to_a_dead_end(folder, tmp_path, capsys, monkeypatch):
+    """Both garments are in the picture, each at its place; one that lies inside the lower is not to be fitted to bare skin."""
+    from ncs_jax.view import motion_sheet
+
+    drawn = []
+    render = motion_sheet.render
+    monkeypatch.setattr(motion_sheet, "render", lambda meshes, *a, **k: drawn.append(meshes) or render(meshes, *a, **k))
+    text = (folder / "outer.toml").read_text()
+    for name, file in (("outer", "outer"), ("inside", "inner")):
+        (folder / f"{name}.toml").write_text(text.replace("outer.npz", f"{file}.npz"))
+        assert main(["check", str(folder / f"{name}.toml"), "--out", str(tmp_path / "check.png")]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("garment inside the body at rest" in said) == (name == "inside")
+        assert "push it out: ncs fit" not in said
+        assert ("room over the garment below" in said) == (name == "inside")
+    body, upper, below = (np.asarray(mesh.vertices) for mesh in drawn[0])
+    radius = [np.median(np.linalg.norm((x - x.mean(0))[:, [0, 2]], axis=1)) for x in (upper, below)]
+    assert len(upper) == len(below) == 336 and radius[0] > radius[1] + 0.01 and len(body) > 100

@@ -112,6 +112,12 @@ def test_material_axes_follow_the_map_and_lie_in_the_faces(rng):
         normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1, rtol=1e-12)
         np.testing.assert_allclose(np.sum(u * normal, axis=1), 0, atol=1e-15)
+    np.testing.assert_array_equal(material_axes(vertices, faces, uv[faces]), u := material_axes(vertices, faces, uv))
+    cut = uv[faces]
+    cut[::2] = cut[::2][..., ::-1]  # every other face lies turned in a map of its own: a seam at each of its edges
+    apart = material_axes(vertices, faces, cut)
+    np.testing.assert_array_equal(apart[1::2], u[1::2])
+    np.testing.assert_array_equal(apart[::2], material_axes(vertices, faces, uv[:, ::-1])[::2])
     # along the warp, moving on the cloth changes v and not u
     u = material_axes(vertices, faces, uv)
     for f, face in enumerate(faces):

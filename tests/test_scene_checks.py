@@ -56,6 +56,14 @@ def test_material_out_of_range(tmp_path, plain_jax, what):
     assert risk.what == what and "safe" in risk.value and "physics" in risk.mend
 
 
+def test_a_membrane_with_warp_and_weft_needs_a_map(tmp_path, plain_jax):
+    woven = SOUND.replace("[network]", '[physics.membrane]\nmodel = "baraff_witkin"\n[network]')
+    (risk,) = found(tmp_path, woven)
+    assert risk.what == "warp and weft" and "UV" in risk.mend
+    vertices, faces = grid()
+    assert found(tmp_path, woven, cloth={"vertices": vertices, "faces": faces, "uv": vertices[:, :2]}) == []
+
+
 def test_frame_rate_out_of_range(tmp_path, plain_jax):
     two = found(tmp_path, SCENE.replace("fps = 30", "fps = 1000"))
     assert [risk.what for risk in two] == ["time step", "time step of a recurrence"] and "1/1000" in two[0].value

@@ -214,7 +214,7 @@ def find_risks(a: Setting) -> list[Risk]:
         found += _shows(a, faces)
     found += [*_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:
-        below = "push it out of the garment below where it was made: ncs fit knows the body alone"
+        below = "give it room over the garment below where it was made, or fit it with a larger ncs fit --clearance"
         mend = below if a.model.under else "push it out: ncs fit"
         found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), mend)
     for name in a.motions:

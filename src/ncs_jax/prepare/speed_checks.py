@@ -36,9 +36,8 @@ def speed_faults(a: Setting, name: str) -> Iterator[tuple[str, str, str, str]]:
     record = a.motions[name]
     faults = [fault for fault in (_jumps(a, name, record), _turns(a, name, record), _throws(a, name, record)) if fault]
     good = good_stretches(name, record, np.any([fault.frames for fault in faults], axis=0)) if faults else ()
-    for fault in faults:
-        what, value, risk, mend = fault.words
-        yield what, value, risk, f"{mend}; good stretches of it: {', '.join(good)}" if good else mend
+    for number, (what, value, risk, mend) in enumerate(fault.words for fault in faults):
+        yield what, value, risk, f"{mend}; good stretches of it: {', '.join(good)}" if good and not number else mend
 
 
 def good_stretches(name: str, record: MotionRecord, bad: np.ndarray) -> list[str]:
