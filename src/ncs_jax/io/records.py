@@ -94,6 +94,7 @@ class MotionRecord:
         source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
         bones: as in a body.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
+        uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees.
     """
 
     poses: np.ndarray
@@ -109,6 +110,7 @@ class MotionRecord:
     source: SkeletonPoses | None = None
     bones: tuple[str, ...] = ()
     undriven: dict[str, str] = field(default_factory=dict)
+    uncertain: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,7 @@ def retarget(
     used = set(driven.values())
     still, unused = tuple(n for n in names if n not in driven), tuple(n for n in motion.joint_names if n not in used)
     lacking, shown = _lacking(motion, names, target, pairs), _shown(motion, scale * places @ upright.T)
-    moved = MotionRecord(local, translation, motion.fps, names, source=shown, undriven=lacking)
+    moved = MotionRecord(local, translation, motion.fps, names, source=shown, undriven=lacking, uncertain=motion.uncertain)
     result = Retargeted(moved, driven, still, unused, scale)
     notes = [*_notes(result, motion.joint_names, source.shaped, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:

@@ -182,6 +182,15 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
         yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
 
 
+def _uncertain(record: MotionRecord, name: str) -> Iterator[Risk]:
+    """Yield a risk where the pose since which a motion is told had to be built, with the parts that may be wrong."""
+    if record.uncertain:
+        value = ", ".join(f"{part} {error:.0f}" for part, error in record.uncertain.items())
+        mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
+        risk = "they lean, or look up or down, by so much in all frames"
+        yield Risk("the pose at rest had to be built", f"right to about so many degrees: {value}, in {name}", risk, mend)
+
+
 def _postures(a: Setting) -> Iterator[Risk]:
     """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
     world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
@@ -192,7 +201,7 @@ def _postures(a: Setting) -> Iterator[Risk]:
 
 def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
-    found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found = [risk for name, record in a.motions.items() for told in (_undriven, _uncertain) for risk in told(record, name)]
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
