@@ -364,3 +364,25 @@ def test_the_tool_that_tries_folders_tells_what_is_off(tmp_path, body, capsys):
     capsys.readouterr()
     assert check_inputs([str(tmp_path)]) == 1
     assert "limbs to 0.00 degrees" in (told := capsys.readouterr().out) and "not all pass" in told
+
+
+def test_the_tool_compares_no_places_above_joints_that_one_file_lacks(tmp_path, body, capsys):
+    """A second joint in the neck moves the head's place, which is told and not judged; which way the head looks is judged."""
+    motion = walk(size=100.0)
+    motion = replace(motion, translation=motion.translation * 100)
+    head = next(j for j, n in enumerate(motion.joint_names) if n.endswith("Head"))
+    turns = 0.3 * np.sin(np.arange(FRAMES))[:, None] * [1.0, 0, 0]
+    names = (*motion.joint_names[:head], "mixamorig:Neck1", *motion.joint_names[head:])
+    parents = np.asarray(motion.parents)
+    above = np.insert(np.where(parents >= head, parents + 1, parents), head, parents[head]).astype(np.int32)
+    above[head + 1] = head
+    joints = np.insert(np.asarray(motion.joints), head, np.asarray(motion.joints)[[parents[head], head]].mean(axis=0), axis=0)
+    path = {names[0]: joints[0] + motion.translation}
+    (tmp_path / "twin.bvh").write_text(bvh_text(motion, path))
+    for undone, code in ((-turns, 0), (0 * turns, 1)):  # the head turns back as far as the neck turns, or goes with it
+        poses = np.insert(motion.poses, head, turns, axis=1)
+        poses[:, head + 1] = (Rotation.from_rotvec(undone) * Rotation.from_rotvec(motion.poses[:, head])).as_rotvec()
+        other = replace(motion, poses=poses, joint_names=names, parents=above, joints=joints)
+        (tmp_path / "x.bvh").write_text(bvh_text(other, path))
+        assert check_inputs([str(tmp_path)]) == code
+        assert "places not compared, as the files differ below them: Head" in capsys.readouterr().out

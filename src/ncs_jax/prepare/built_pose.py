@@ -1,7 +1,7 @@
 """A pose built from all frames of a motion: how a person stands, where neither a frame nor the zero pose tells.
 
 Trunk and head stand as they do on average while the person is straightest. People who dance, carry or bend are not straight on
-average, so that is weighed against how skeletons are built: at rest the hip joints, the chest and the head lie above each other,
+average. That is weighed against how skeletons are built: at rest the hip joints, the chest and the head lie above one another,
 and no foot points up. With theta_j the pitch of joint j against its mean, and tau_k(theta) that of a chain of bones,
 
     min sum_j (theta_j / s_j)^2 + sum_k (d(tau_k(theta), [a_k, b_k]) / s)^2
