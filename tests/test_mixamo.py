@@ -179,7 +179,7 @@ def write_glb(path: Path, motion: MotionRecord, *, where: str, size: float, skin
     gltf.scenes, gltf.scene = [gl.Scene(nodes=[0])], 0
     if skin:
         x, faces = skin_of(rest[0])
-        owner, weight = np.zeros((count, 4), np.uint8), np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+        owner, weight = np.zeros((count, 4), np.uint8), np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
         owner[:, 0] = np.arange(count)
         gltf.nodes.append(gl.Node(name="Mesh", mesh=0, skin=0))
         gltf.nodes[0].children.append(1 + count)

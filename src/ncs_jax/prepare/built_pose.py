@@ -11,7 +11,7 @@ is the most likely pose, d being the distance from an interval. The second deriv
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -121,11 +121,11 @@ class _Builder:
     def trunk(self) -> tuple[dict[int, np.ndarray], dict[int, float]]:
         """C (3, 3) of the joints from hips to head, and their likely errors in degrees."""
         joints = trunk_of(self.of)
-        given = [self._upright(j, above) for j, above in zip(joints, [*joints[1:], None], strict=True)]
-        turns, settled = [columns.T for columns, _ in given], np.array([one for _, one in given])
-        bones = np.array([c @ self._bone(a, b) for c, (a, b) in zip(turns, pairwise(joints), strict=False)])
-        thighs = [self.of.roles.get(f"{side} thigh") for side in ("left", "right")]
-        if None not in thighs:
+        found = [self._upright(j, above) for j, above in zip(joints, [*joints[1:], None], strict=True)]
+        turns, settled = [columns.T for columns, _ in found], np.array([one for _, one in found])
+        bones = np.array([c @ self._bone(a, b) for c, (a, b) in zip(turns[:-1], pairwise(joints), strict=True)])
+        thighs = [j for side in ("left", "right") if (j := self.of.roles.get(f"{side} thigh")) is not None]
+        if len(thighs) == 2:
             bones[0] -= turns[0] @ np.mean([self._bone(joints[0], j) for j in thighs], axis=0)
         size, chest, last = np.linalg.norm(bones.sum(axis=0)), len(self.of.spine), len(bones)
         ahead = np.degrees(np.arctan(APART * size / np.maximum(np.linalg.norm(bones, axis=1), 1e-9 * size)))
@@ -139,7 +139,7 @@ class _Builder:
             sums = np.array([now[first:end].sum(axis=0) for first, end, _ in chains]).reshape(-1, 3)
             return np.append(theta / given, _beyond(np.degrees(np.arctan2(sums[:, 2], sums[:, 1])), [c[2] for c in chains]))
 
-        theta, deviation = _most_likely(misfit, len(joints))
+        theta, deviation = _most_likely(misfit, len(joints), [chain[2] for chain in chains])
         turned = [Rotation.from_rotvec(t * LEFT, degrees=True).as_matrix() @ c for t, c in zip(theta, turns, strict=True)]
         return dict(zip(joints, turned, strict=True)), dict(zip(joints, deviation.tolist(), strict=True))
 
@@ -153,7 +153,9 @@ class _Builder:
             return turns, dict.fromkeys(turns, POSTURE)
         down = np.degrees([np.arctan2(-b[1], np.linalg.norm(b[[0, 2]])) for b in bones])
         theta, deviation = _most_likely(
-            lambda t: np.concatenate([t / LEVEL, [np.diff(down + t)[0] / ALIKE], _beyond(down + t, [FOOT, FOOT])]), 2
+            lambda t: np.concatenate([t / LEVEL, [np.diff(down + t)[0] / ALIKE], _beyond(down + t, [FOOT, FOOT])]),
+            2,
+            [FOOT, FOOT],
         )
         for (j, c), t, b in zip(list(turns.items()), theta, bones, strict=True):
             axis = np.cross(UP, b * (1, 0, 1))
@@ -286,13 +288,21 @@ def _turn(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(Rotation.from_matrix(a.T @ b).magnitude()))
 
 
-def _beyond(pitch: np.ndarray, bounds: list[tuple[float, float]]) -> np.ndarray:
+def _beyond(pitch: np.ndarray, bounds: Sequence[tuple[float, float]]) -> np.ndarray:
     """Return by how many times `BEYOND` pitches (n,) lie outside of their bounds, 0 within."""
     low, high = np.transpose(bounds).reshape(2, -1)
     return (pitch - np.clip(pitch, low, high)) / BEYOND
 
 
-def _most_likely(misfit: Callable[[np.ndarray], np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the angles (count,) for which the squares of a misfit have the least sum, and their deviations (count,)."""
+def _most_likely(
+    misfit: Callable[[np.ndarray], np.ndarray], count: int, bounds: Sequence[tuple[float, float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the angles (count,) for which the squares of a misfit have the least sum, and their deviations (count,).
+
+    The last of the misfit are those of `bounds`. One that is in force says that an angle is at its end or farther in, so for
+    the deviations it counts with half its width.
+    """
     found = least_squares(misfit, np.zeros(count))
-    return found.x, np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    shares = found.jac.copy()
+    shares[len(shares) - len(bounds) :] *= (2 * BEYOND / np.ptp(np.reshape(bounds, (-1, 2)), axis=1))[:, None]
+    return found.x, np.sqrt(np.diag(np.linalg.inv(shares.T @ shares)))

@@ -6,7 +6,7 @@ and nothing fails; outside them a scene is at risk. What cannot work at all is r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,13 +182,17 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
         yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
 
 
-def _uncertain(record: MotionRecord, name: str) -> Iterator[Risk]:
-    """Yield a risk where the pose since which a motion is told had to be built, with the parts that may be wrong."""
-    if record.uncertain:
-        value = ", ".join(f"{part} {error:.0f}" for part, error in record.uncertain.items())
+def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
+    """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most."""
+    built = {name: record.uncertain for name, record in motions.items() if record.uncertain}
+    if built:
+        parts = dict.fromkeys(part for one in built.values() for part in one)
+        worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)
         mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
         risk = "they lean, or look up or down, by so much in all frames"
-        yield Risk("the pose at rest had to be built", f"right to about so many degrees: {value}, in {name}", risk, mend)
+        yield Risk(
+            "the pose at rest had to be built", f"right to about so many degrees: {worst}, in {', '.join(built)}", risk, mend
+        )
 
 
 def _postures(a: Setting) -> Iterator[Risk]:
@@ -201,7 +205,8 @@ def _postures(a: Setting) -> Iterator[Risk]:
 
 def find_risks(a: Setting) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
-    found = [risk for name, record in a.motions.items() for told in (_undriven, _uncertain) for risk in told(record, name)]
+    found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found += _uncertain(a.motions)
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
