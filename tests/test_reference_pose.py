@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +13,17 @@ from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.packaged import packaged
+from ncs_jax.prepare.built_pose import build_pose
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.prepare.posture_checks import posture_faults
+from ncs_jax.prepare.retarget import paired
+from ncs_jax.prepare.scene_checks import _uncertain
 from ncs_jax.scene.spec import MotionSpec
 from tests.test_retarget import figure, forward
 from tools.check_inputs import main as check_inputs
 
 FRAMES = 48
+UP = np.array([0, 1.0, 0])
 TIPPED = Rotation.from_rotvec([0.6, 0, 0]).as_matrix()
 
 
@@ -158,6 +163,57 @@ def test_a_zero_pose_that_is_a_moment_of_the_motion_is_not_taken_for_standing(bo
     assert "a moment of a movement" in " ".join(taken[2].notes) and "degrees; motion.rest" in " ".join(taken[2].notes)
     short = replace(other, poses=other.poses[:2], translation=other.translation[:2])  # too few frames to know better
     assert not any("reference pose" in note for note in retarget_to_body(short, body, MotionSpec()).notes)
+
+
+def bent(motion: MotionRecord, part: str, degrees: float, others: tuple[str, ...] = ()) -> MotionRecord:
+    """The motion with a joint that bends ahead in all frames, and others that bend back by as much."""
+    poses = motion.poses.copy()
+    for j, (_, name) in enumerate(figure("mixamo")[3]):
+        by = degrees * ((name == part) - (name in others))
+        poses[:, j] = (Rotation.from_euler("x", by, degrees=True) * Rotation.from_rotvec(motion.poses[:, j])).as_rotvec()
+    return replace(motion, poses=poses)
+
+
+@pytest.mark.parametrize(("part", "others", "degrees"), [("spine", (), 25), ("hips", ("thigh",), 20), ("foot", (), 50)])
+def test_whoever_bends_in_all_frames_is_not_straight(body, part, others, degrees):
+    """A trunk, a pelvis, feet on tiptoe: what no skeleton is at rest is not taken for standing, and what is unsure is told."""
+    motion = bent(walk(), part, degrees, others)
+    turns = forward(np.asarray(motion.joints), np.asarray(motion.parents), motion)[0][4]
+    right, taken = driven(motion, body), driven(told_since(motion, turns), body)
+    joint = {"spine": "Spine1", "hips": "Hips", "foot": "LeftFoot"}[part]
+    told = taken[2].uncertain
+    off = apart(right, taken)[0][body.joint_names.index(joint)]
+    assert off < 0.6 * degrees and off < 3 * told[{"spine": "chest", "hips": "hips", "foot": "feet"}[part]]
+    assert told["head"] >= 10 and not right[2].uncertain
+    (risk,) = _uncertain({"a.bvh": right[2], "b.bvh": taken[2]})
+    assert f"head {told['head']:.0f}" in risk.value and risk.value.endswith("in b.bvh") and "motion.rest" in risk.mend
+
+
+def test_recordings_whose_t_pose_is_withheld(body):
+    """44 recordings of one skeleton, of which eight begin with its T-pose: bones of the others pitch as they do there."""
+    folder = Path(__file__).parents[2] / "shared" / "data" / "cmu_mocap_bvh"
+    if not folder.is_dir():
+        pytest.skip("needs the recordings of ../shared/data/cmu_mocap_bvh")
+    rest, off = np.asarray(io.read_motion(folder / "007_03.bvh").joints), []
+    for name in ("001_01", "002_02", "005_02", "005_06", "005_17", "006_04", "006_08", "006_12", "007_01"):
+        motion = io.read_motion(folder / f"{name}.bvh")
+        joints, names = np.asarray(motion.joints), motion.joint_names
+        turns, _ = build_pose(motion, paired(motion, body, {})[0], "y", moment=True)
+        bones = [
+            ("Hips", "Spine"),
+            ("Spine2", "Neck"),
+            ("Neck", "Head"),
+            ("LeftFoot", "LeftToeBase"),
+            ("RightFoot", "RightToeBase"),
+        ]
+        at = np.array([(names.index(a), names.index(b)) for a, b in bones])
+        ours, theirs = (
+            np.einsum("jab,jb->ja", turns[at[:, 0]], joints[at[:, 1]] - joints[at[:, 0]]),
+            rest[at[:, 1]] - rest[at[:, 0]],
+        )
+        off.append([np.degrees(np.arctan2(np.linalg.norm(v[..., [0, 2]], axis=-1), v[..., 1])) for v in (ours, theirs)])
+    error = np.abs(np.diff(off, axis=1)[:, 0])
+    assert (np.median(error, axis=0) < [11, 6, 10, 5, 5]).all() and (error.max(axis=0) < [15, 10, 26, 8, 8]).all(), error
 
 
 def test_what_has_no_reference_pose_is_refused(rng, body):

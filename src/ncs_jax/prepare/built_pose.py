@@ -300,9 +300,9 @@ def _most_likely(
     """Return the angles (count,) for which the squares of a misfit have the least sum, and their deviations (count,).
 
     The last of the misfit are those of `bounds`. One that is in force says that an angle is at its end or farther in, so for
-    the deviations it counts with half its width.
+    the deviations it counts with half its width. An angle that had to go far is in doubt by half of its way.
     """
     found = least_squares(misfit, np.zeros(count))
     shares = found.jac.copy()
     shares[len(shares) - len(bounds) :] *= (2 * BEYOND / np.ptp(np.reshape(bounds, (-1, 2)), axis=1))[:, None]
-    return found.x, np.sqrt(np.diag(np.linalg.inv(shares.T @ shares)))
+    return found.x, np.hypot(np.sqrt(np.diag(np.linalg.inv(shares.T @ shares))), found.x / 2)
