@@ -124,6 +124,8 @@ class _Builder:
         found = [self._upright(j, above) for j, above in zip(joints, [*joints[1:], None], strict=True)]
         turns, settled = [columns.T for columns, _ in found], np.array([one for _, one in found])
         bones = np.array([c @ self._bone(a, b) for c, (a, b) in zip(turns[:-1], pairwise(joints), strict=True)])
+        if not len(bones):  # legs alone
+            return dict(zip(joints, turns, strict=True)), dict.fromkeys(joints, POSTURE)
         thighs = [j for side in ("left", "right") if (j := self.of.roles.get(f"{side} thigh")) is not None]
         if len(thighs) == 2:
             bones[0] -= turns[0] @ np.mean([self._bone(joints[0], j) for j in thighs], axis=0)
