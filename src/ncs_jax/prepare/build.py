@@ -68,7 +68,7 @@ def build(
         below: the trained garments of `garment.over`, each with the body that it was trained on.
         dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words; without
             one, what takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
-        ahead: called before vibrations are looked for, with what will be returned if there are any, these as shapes alone.
+        ahead: called before vibrations are looked for, with what is expected: zeros in their place.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
@@ -143,12 +143,12 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
 
 
 def _expected(setting: Setting, model: Model, track: MotionFeatures) -> Assembly:
-    """Return what a scene becomes whose garment has all the vibrations that it may have, these as shapes alone."""
+    """Return what a scene becomes whose garment has all the vibrations that it may have: of zeros, as they are not known."""
     scene, basis = setting.scene, model.basis
-    count, shape = scene.network.vibrations, functools.partial(jax.ShapeDtypeStruct, dtype=basis.dtype)
-    model = replace(model, vibrations=RitzModes(shape((len(basis), 3, count)), shape(()), shape((count, count))))
-    setting = replace(setting, model=model)
-    return Assembly(**vars(setting), network=network_from(scene, model), training_features=track)
+    count, zeros = scene.network.vibrations, functools.partial(np.zeros, dtype=basis.dtype)
+    modes = RitzModes(*map(jax.device_put, (zeros((len(basis), 3, count)), zeros(()), zeros((count, count)))))
+    setting = replace(setting, model=replace(model, vibrations=modes))
+    return Assembly(**vars(setting), network=network_from(scene, setting.model), training_features=track)
 
 
 def _range(scene: Scene, model: Model, track: MotionFeatures) -> np.ndarray:

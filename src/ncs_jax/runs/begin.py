@@ -36,7 +36,7 @@ def assemble_run(
     *,
     terms: Sequence[OwnTerm],
     network: NetworkMaker | None,
-    ahead: Callable[[Assembly], None],
+    ahead: Callable[[Assembly], None] | None = None,
 ) -> tuple[Assembly, dict | None]:
     """Make the scene of a run ready; return it, and the weights that it begins with where it begins with another run's.
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 from jax.stages import Compiled
+from jax.tree_util import PyTreeDef
 from jaxtyping import Array
 
 from ncs_jax.energies.contact.surface import rebuild_lists
@@ -130,23 +131,29 @@ class PlacedScene:
 def begin_programs(programs: Programs, assembly: Assembly, count: int) -> None:
     """Begin to compile what trains a scene `count` steps and what measures it then, where a single device does it.
 
-    Of the arrays of the assembly the shapes are enough.
+    Of the arrays of the assembly no more than their shapes counts.
     """
     network, batch = assembly.network, assembly.scene.training.batch
+    structures: list[PyTreeDef] = []
     if batch_mesh(batch) is not None:
         return
 
-    def placed(model: Model, track: MotionFeatures) -> tuple[TrainState, MotionFeatures, MotionFeatures]:
-        state, bodies = initial_state(model, network, 0), with_bodies(model, track, batch)
+    def shapes(model: Model, track: MotionFeatures) -> list[list[Array]]:
+        state, placed, ends = (
+            initial_state(model, network, 0),
+            with_bodies(model, track, batch),
+            np.zeros((count, batch), np.int32),
+        )
         told = refreshed(network, state.params, model, track) if network.refreshes else {}
-        return state, replace(track, **told), replace(bodies, **told)
+        chunk = state, ends, ends, count, model, replace(placed, **told)
+        metrics = model, state.params, replace(track, **told), ends[0, :SEEN]
+        structures.extend(map(jax.tree.structure, (chunk, metrics)))
+        return [jax.tree.leaves(chunk), jax.tree.leaves(metrics)]
 
-    state, features, everywhere = jax.eval_shape(placed, assembly.model, assembly.track)
-    chunk, metrics = _functions(assembly, None)
-    some = jax.ShapeDtypeStruct((count, batch), np.int32)
-    programs.begin("chunk", chunk, state, some, some, count, assembly.model, everywhere, reused=True)
-    ends = jax.ShapeDtypeStruct((min(SEEN, batch),), np.int32)
-    programs.begin("metrics", metrics, assembly.model, state.params, features, ends)
+    chunk, metrics = jax.eval_shape(shapes, assembly.model, assembly.track)
+    steps, measures = _functions(assembly, None)
+    programs.begin("chunk", steps, chunk, structures[0], reused=True)
+    programs.begin("metrics", measures, metrics, structures[1])
 
 
 def _functions(assembly: Assembly, mesh: Mesh | None) -> tuple[Callable, Callable]:

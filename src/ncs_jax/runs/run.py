@@ -212,7 +212,7 @@ def assemble(
             and model, see `network.methods.method.Method`; else the scene's.
         dtype: of everything; float64 needs JAX's x64 mode. report: called with what is done next, in words; without one, what
             takes long is told on stderr in a terminal or a notebook, and nothing elsewhere. ahead: called before that with
-            what is expected, its vibrations as shapes alone, so that programs can be compiled meanwhile.
+            what is expected, zeros in the place of the vibrations, so that programs can be compiled meanwhile.
 
     What takes long are the vibrations of `network.cell = "swing"`. Energies need none: with "gated" none are looked for.
 

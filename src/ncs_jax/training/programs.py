@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.stages import Compiled
+from jax.tree_util import PyTreeDef
 
 __all__ = ["Programs"]
 
@@ -25,19 +27,18 @@ class Programs:
         self._threads = ThreadPoolExecutor(THREADS, "compile")
         self._begun: dict[tuple, Future[Compiled]] = {}
 
-    def begin(self, name: str, program: Callable, *arguments, reused: bool = False) -> None:
-        """Begin to compile a program, known by a name, for arguments of which shapes are enough."""
-        self._future(name, program, arguments, reused)
+    def begin(self, name: str, program: Callable, leaves: Sequence, structure: PyTreeDef, *, reused: bool = False) -> None:
+        """Begin to compile a program, known by a name, for arguments whose leaves are given, or no more than their shapes."""
+        self._future(name, program, leaves, structure, reused)
 
     def ready(self, name: str, program: Callable, *arguments, reused: bool = False) -> Compiled:
         """Return a program for arguments, compiled; it is begun now unless it was for others of their shapes and types."""
-        return self._future(name, program, arguments, reused).result()
+        return self._future(name, program, *jax.tree.flatten(arguments), reused).result()
 
-    def _future(self, name: str, program: Callable, arguments: tuple, reused: bool) -> Future[Compiled]:
-        leaves, structure = jax.tree.flatten(arguments)
-        kind = name, structure, *((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    def _future(self, name: str, program: Callable, leaves: Sequence, structure: PyTreeDef, reused: bool) -> Future[Compiled]:
+        kind = name, structure, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         if kind not in self._begun:
-            first = range(len(jax.tree.leaves(arguments[0]))) if reused else ()
+            first = range(structure.children()[0].num_leaves) if reused else ()
             flat = jax.jit(lambda *leaves: program(*structure.unflatten(leaves)), donate_argnums=first)
             self._begun[kind] = self._threads.submit(flat.lower(*leaves).compile)
         return self._begun[kind]
