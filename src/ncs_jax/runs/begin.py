@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -36,11 +36,13 @@ def assemble_run(
     *,
     terms: Sequence[OwnTerm],
     network: NetworkMaker | None,
+    ahead: Callable[[Assembly], None] | None = None,
 ) -> tuple[Assembly, dict | None]:
     """Make the scene of a run ready; return it, and the weights that it begins with where it begins with another run's.
 
     Args:
         scene: the run's. facts: of the run that is resumed, if any, in the folder `out`. start: a run to begin from, if any.
+        ahead: called with what is expected while more is found out, see `run.assemble`.
 
     Raises:
         InputError: a file is unusable, or terms, network or the run to begin from do not fit.
@@ -49,7 +51,7 @@ def assemble_run(
         return _assemble_started(start, scene, terms, network)
     if facts is not None and out is not None:
         check_own(facts, out, terms, network)
-    assembly = assemble(scene, terms=terms, network=network)
+    assembly = assemble(scene, terms=terms, network=network, ahead=ahead)
     if facts is not None and out is not None and facts.get("start"):  # of the run it began from: not found anew
         assembly = _with_fields_of(read_prepared(out), assembly)
     return assembly, None

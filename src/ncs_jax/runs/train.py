@@ -22,12 +22,13 @@ from ncs_jax.metrics.quality import summarise
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
-from ncs_jax.runs.placed_scene import PlacedScene
+from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
 from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
 from ncs_jax.runs.run import NetworkMaker, Run, own_names
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.training.batches import CHUNK, chunks
 from ncs_jax.training.devices import trim_memory
+from ncs_jax.training.programs import Programs
 from ncs_jax.training.step import TrainState
 
 __all__ = ["train"]
@@ -77,15 +78,18 @@ def train(
     facts = facts_of_run(out, resume)
     if out is not None and facts is not None:
         scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
-    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network)
+    programs, first = Programs(), CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps)
+    begin = functools.partial(begin_programs, programs, count=first)  # while the rest is found out
+    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network, ahead=begin)
     trim_memory()
-    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed)
+    begin(assembly)
+    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed, programs)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
     state = placed.initial_state(params)
     placed.refresh(state.params)
     if facts is None:  # before anything is written: whether it fits into memory
-        placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps))
+        placed.compile(state, first)
         facts = {"steps": 0, **own_names(terms, network)} | ({"start": str(start)} if start else {})
     with closing(_Output(placed, out, report, facts)) as output:
         if params is not None:
