@@ -63,11 +63,10 @@ def test_training(tmp_path, capsys):
 
 
 def test_training_by_batch(tmp_path, capsys):
-    rows = figures(training, tmp_path, "--repeats", "1", "--batches", "2", "6")["rows"]
-    assert list(rows) == ["step, batch 2", "step, batch 6"]
-    assert all(
-        row["windows/s"] == pytest.approx(n / row["seconds"]["median"]) for n, row in zip((2, 6), rows.values(), strict=True)
-    )
+    rows = figures(training, tmp_path, "--repeats", "1", "--batches", "6")["rows"]
+    assert list(rows) == ["step, batch 6"]
+    row = rows["step, batch 6"]
+    assert row["windows/s"] == pytest.approx(6 / row["seconds"]["median"])
     assert "windows/s" in capsys.readouterr().out
 
 
