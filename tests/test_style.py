@@ -259,6 +259,21 @@ def test_what_is_forbidden(name):
         assert not re.search(r"jax\.config\.update|\bprint\(", path.read_text(encoding="utf-8"))
 
 
+PRODUCTS = re.compile(r"jnp\.(dot|vdot|inner|einsum|matmul|tensordot)$")
+LEARNED = {"outward", "_outward_backward"}  # of layers, as fast as the device has them
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if room(name) in NUMERIC])
+def test_a_product_of_positions_says_its_precision(name):
+    """Left to itself, a GPU keeps 10 bits of each factor."""
+    source = tree(MODULES[name])
+    learned = [n for n in ast.walk(source) if isinstance(n, ast.FunctionDef) and n.name in LEARNED]
+    aside = {id(n) for function in learned for n in ast.walk(function)}
+    for node in ast.walk(source):
+        if isinstance(node, ast.Call) and PRODUCTS.search(ast.unparse(node.func)) and id(node) not in aside:
+            assert "precision" in {k.arg for k in node.keywords}, f"line {node.lineno}: {ast.unparse(node)}"
+
+
 @pytest.mark.parametrize("path", TESTS, ids=lambda p: p.stem)
 def test_a_test_file_can_fail(path):
     """It has tests, and they assert, compare by numpy.testing or expect an exception; no assertion is a constant."""
