@@ -48,8 +48,10 @@ def preview(
 
     The picture and the page come first, the measures last, and the page is then written again with them. Strain and penetration
     are exact, of every n-th frame, so that there are no more than `MEASURED`: `ncs evaluate` measures all, and the energies.
-    Keys: strain_mean (%), and with a body penetrating (%) and depth_max (mm), as in `metrics.quality.QUANTITIES`; every, which
-    is n. The curves need a log and matplotlib, of the `plots` extra.
+    Keys: strain_mean (%), and with a body penetrating (%), depth_max and middle_depth_max (mm), as in
+    `metrics.quality.QUANTITIES`; every, which is n, and measured, how many frames that is. Where skin is outside the cloth in
+    any of them, also between vertices: bare, in how many, and barest, the number of that where it is farthest. The curves need
+    a log and matplotlib, of the `plots` extra.
 
     Args:
         run: trained.
@@ -112,7 +114,11 @@ def _measured(run: Run, animation: Animation) -> dict[str, float]:
         count = whole.shape[1] - animation.body.worn
         skin = np.concatenate([whole[::every, part], whole[::every, count:]], axis=1)
     rows = measure_on_host(run.assembly.model, animation.garment[::every], skin)
-    return summarise(rows) | {"every": float(every)}
+    found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
+    if "depth_max" in rows:
+        out = np.maximum(rows["depth_max"], rows["middle_depth_max"])
+        found |= {"bare": float((out > 0).sum()), "barest": float(every * out.argmax())} if out.any() else {}
+    return found
 
 
 def _draw_curves(folder: Path, log: Path) -> Path | None:
