@@ -166,7 +166,9 @@ def place(
     if move is not None:
         return replace(ranked[0][1], doubt="")
     chosen = _choose(ranked, fine, skin)
-    return hanging if chosen.doubt and hanging is not None else chosen
+    if hanging is None or not (chosen.doubt or chosen.shift.any()):
+        return chosen
+    return hanging if chosen.doubt else replace(chosen, doubt=HANGS)  # it lay closer a little lower than where it was made
 
 
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
