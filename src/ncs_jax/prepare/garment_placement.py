@@ -166,9 +166,10 @@ def place(
     if move is not None:
         return replace(ranked[0][1], doubt="")
     chosen = _choose(ranked, fine, skin)
-    if hanging is None or not (chosen.doubt or chosen.shift.any()):
-        return chosen
-    return hanging if chosen.doubt else replace(chosen, doubt=HANGS)  # it lay closer a little lower than where it was made
+    if chosen.doubt:
+        return hanging or chosen
+    tube = chosen.shift.any() and upper_opening([chosen.garment.vertices[loop] for loop in fine.loops]) is not None
+    return replace(chosen, doubt=HANGS) if tube else chosen  # it lies closer a little lower than where it was made
 
 
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
