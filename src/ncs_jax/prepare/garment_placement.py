@@ -40,6 +40,9 @@ HELD = 0.15, 1.0  # but not upward, where it loses so much of its contact, and s
 EASE = -0.002, 0.02  # of the height: the waist of what hangs is wider than the trunk on all sides by between these,
 SHAPED, CENTRED = 0.004, 0.006  # and so far, at most, are its shape from the trunk's and, if it stays, its middle from there
 USUAL, LIKE = 0.006, 0.25  # of the height: it is most often wider by this, and how much less that counts than its shape
+CLOSE = (
+    0.4  # of the misfit of cloth that is nowhere near the skin: a tube of less misfit fits closely, and its place is certain
+)
 SUNK = 0.1  # of its area may be inside the body: it is pushed out
 STAYED = "it hangs, and only its waist tells where: it stays at the height that the file has"
 HANGS = "it hangs, and the girth of its waist tells its height only to some centimetres"
@@ -168,8 +171,7 @@ def place(
     chosen = _choose(ranked, fine, skin)
     if chosen.doubt:
         return hanging or chosen
-    tube = chosen.shift.any() and upper_opening([chosen.garment.vertices[loop] for loop in fine.loops]) is not None
-    return replace(chosen, doubt=HANGS) if tube else chosen  # it lies closer a little lower than where it was made
+    return replace(chosen, doubt=HANGS) if _loose_tube(chosen, ranked, fine, skin) else chosen
 
 
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
@@ -383,6 +385,13 @@ def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
             warning = f"it is loose, and only what carries it tells its height: {100 * step:.0f} cm higher it still has "
             warning += f"{100 * (1 - less):.0f} % of the contact"
     return "", warning
+
+
+def _loose_tube(chosen: Placement, ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> bool:
+    """Tell whether a garment that was moved only hangs there: it lies closest some centimetres lower than where it was made."""
+    way = next(way for way, look in ranked if look.garment is chosen.garment)
+    loops = [chosen.garment.vertices[loop] for loop in cloth.loops]
+    return bool(way.shift.any()) and way.cost > CLOSE * SKIN * skin.height and upper_opening(loops) is not None
 
 
 def _hung(ways: list[_Way], raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRecord) -> tuple[Placement | None, ...]:
