@@ -48,8 +48,8 @@ def preview(
 
     The picture and the page come first, the measures last, and the page is then written again with them. Strain and penetration
     are exact, of every n-th frame, so that there are no more than `MEASURED`: `ncs evaluate` measures all, and the energies.
-    Keys: strain_mean (%), with a body penetrating (%), depth_max, middle_depth_max (mm), see `metrics.quality.QUANTITIES`; every,
-    n; measured, frames. Where skin is outside the cloth: bare, in how many, barest, the worst. The curves need a log, matplotlib.
+    Keys: strain_mean (%), with a body penetrating (%), depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n;
+    measured, frames. Where skin is outside the cloth: bare, in how many; barest, the worst. Curves need a log and matplotlib.
 
     Args:
         run: trained.
