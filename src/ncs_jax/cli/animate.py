@@ -69,7 +69,8 @@ def animate(options) -> int:
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     garment = run.assembly.garment
     fps = run.assembly.model.fps
-    io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, worn_by=worn_by)
+    names = arguments.mesh_names(run.assembly.scene)
+    io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, worn_by=worn_by, names=names)
     print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")

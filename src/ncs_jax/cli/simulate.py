@@ -49,7 +49,8 @@ def simulate(options) -> int:
 
         result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment
-    io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices)
+    names = arguments.mesh_names(scene)
+    io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices, names=names)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
     precision = "double" if result.vertices.dtype == np.float64 else "single"

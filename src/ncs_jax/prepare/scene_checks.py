@@ -14,8 +14,8 @@ import numpy as np
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights
-from ncs_jax.geometry.surface_distance import border_of, signed_distance
 from ncs_jax.io import MotionRecord
+from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
@@ -42,7 +42,6 @@ DEEP = 0.01  # m that vertices may be inside the body, where the body alone carr
 MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
-CLEAR = 0.005  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
 @dataclass(frozen=True)
@@ -109,17 +108,16 @@ def _mesh(a: Setting) -> Iterator[Risk]:
 
 
 def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m, or -`CLEAR` if clear of it."""
+    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m."""
     model, body = a.model, required(a.body, "body")
     rest, skin = (np.asarray(x, np.float64) for x in (model.garment.mesh.rest, required(model.body, "model.body")))
-    border = border_of(faces, int(faces.max()) + 1)
-    depths = []
+    cloths, bodies = [], []
     for pose, transforms in zip(poses, joint_transforms(body, poses)[:, list(model.source_joints)], strict=True):
         bare = corrected_rest(skin, model.correctives, transforms, model.skeleton.parents)
         surface = [carried(bare, required(model.body_blend, "model.body_blend"), transforms), *_worn_below(model, pose)]
-        x = carried(rest, model.blend, transforms)
-        depths.append(-signed_distance(x, np.concatenate(surface), faces, border, CLEAR))
-    return np.stack(depths)
+        cloths.append(carried(rest, model.blend, transforms))
+        bodies.append(np.concatenate(surface))
+    return depths_on_host(np.stack(cloths), np.stack(bodies), faces, layered=bool(model.under))
 
 
 def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
