@@ -1,13 +1,14 @@
 """What a frame costs with a network: streamed, of a whole motion, of many characters at once, and with a smaller decoder.
 
-    python -m benchmarks.inference [SCENE] [--steps 100] [--rank 64] [--frames 500] [--repeats 7] [--quick] [--json FILE]
+    python -m benchmarks.inference [SCENE] [--steps 100] [--rank 64] [--frames 500] [--repeats 7] [--characters 1 256]
+        [--whole] [--quick] [--json FILE]
 
 SCENE is a scene file, which is trained for so many steps, or the folder of a run. A streamed frame is one call of the compiled
 step with its state's memory reused, waited for: its median and 99th percentile are over so many frames. `mm` is how far the
 vertices of the motion are from those of the whole decoder in float32, in the mean and at most; the rank is made for this
-motion, the scene's first. With many characters, who are at different places of the motion, times are a character's. The least
-is that of reading the parameters once and writing the vertices, or of the layers' products at the rate of float32; see
-`benchmarks/work.py`.
+motion, the scene's first. `--whole` leaves the smaller decoders out. With many characters, who are at different places of the
+motion, times are a character's. The least is that of reading the parameters once and writing the vertices, or of the layers'
+products at the rate of float32; see `benchmarks/work.py`.
 """
 
 from __future__ import annotations
@@ -61,6 +62,13 @@ def sequence(garment: Run) -> tuple[Callable, int]:
     return lambda: program(model, network, params, track), len(track.start)
 
 
+def compressed(whole: Run, track, rank: int) -> dict[str, Run]:
+    """The same with smaller decoders, by name."""
+    rank = min(rank, len(track.start), *whole.assembly.network.decoder.sizes)
+    smaller = {"bfloat16": whole.compressed(track, bfloat16=True), f"rank {rank}": whole.compressed(track, rank=rank)}
+    return smaller | {f"rank {rank}, bfloat16": whole.compressed(track, rank=rank, bfloat16=True)}
+
+
 def benchmark(options) -> dict:
     """Measure a scene's inference."""
     if Path(options.scene).is_dir():
@@ -71,9 +79,7 @@ def benchmark(options) -> dict:
     model, motion = whole.assembly.model, whole.assembly.scene.motion.files[0]
     frames = 5 if options.quick else options.frames
     track = whole.track(motion)
-    rank = min(options.rank, len(track.start), *whole.assembly.network.decoder.sizes)
-    smaller = {"bfloat16": whole.compressed(track, bfloat16=True), f"rank {rank}": whole.compressed(track, rank=rank)}
-    smaller[f"rank {rank}, bfloat16"] = whole.compressed(track, rank=rank, bfloat16=True)
+    smaller = {} if options.whole else compressed(whole, track, options.rank)
     if options.quick:
         smaller = dict(list(smaller.items())[-1:])
     rows: dict[str, dict] = {}
@@ -82,15 +88,16 @@ def benchmark(options) -> dict:
         params = for_inference(garment.assembly.network, garment.params, model)[1]
         apart = 1000 * np.linalg.norm(garment.animate(track) - exact, axis=-1)
         error = {"mm mean": float(apart.mean()), "mm max": float(apart.max())}
-        several, count = sequence(garment)
+        at_once, count = sequence(garment)
         rows[f"streamed, {name}"] = {
             "seconds": timed(stream(garment), frames), "work": work.inference(model, params, 1), **error,
         }  # fmt: skip
         rows[f"whole motion, {name}, a frame"] = {
-            "seconds": timed(several, options.repeats, count), "work": work.inference(model, params, count), "times": count,
+            "seconds": timed(at_once, options.repeats, count), "work": work.inference(model, params, count), "times": count,
             **error,
         }  # fmt: skip
-    crowds = [("float32", whole, n) for n in (CHARACTERS[:2] if options.quick else CHARACTERS)]
+    several = [round(n) for n in options.characters] or CHARACTERS
+    crowds = [("float32", whole, n) for n in (several[:2] if options.quick else several)]
     crowds += [(name, garment, crowds[-1][2]) for name, garment in smaller.items()]
     for name, garment, n in crowds:
         params = for_inference(garment.assembly.network, garment.params, model)[1]
@@ -113,6 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         __doc__, benchmark, lambda figures: clocks(figures["rows"], ("frames/s", "mm mean", "mm max")), arguments,
         steps=(100, "of training, where SCENE is no run"), rank=(64, "of the smaller decoder, at most"),
         frames=(500, "streamed ones that are timed"), repeats=(7, "timed calls of the others"),
+        characters=((), f"how many move at once (default: {' '.join(map(str, CHARACTERS))})"),
+        whole=(False, "the whole decoder alone"),
     )  # fmt: skip
 
 

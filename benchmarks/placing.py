@@ -1,11 +1,14 @@
 """How often `ncs fit` brings a garment of another unit, axes and origin home: placed, refused, or wrong.
 
-    python -m benchmarks.placing [--seed 0] [--cases 40] [--shared ../shared/data] [--json FILE]
+    python -m benchmarks.placing [--seed 0] [--cases 40] [--hanging] [--shared ../shared/data] [--json FILE]
 
 Garments of three bodies: the packaged one; a wider, smaller one that was written as .glb and read again; SMPL's, where
 `--shared` has it. On each: shells of its own skin (a top, long sleeves, leggings, shorts), a skirt and a loose dress that hang
 around it, and what was made for it elsewhere (the packaged garments; SMPL's T-shirt and those of GAPS). A case takes one, in
 a random unit, with a random axis up, turned about the vertical by a random quarter, up to 30 cm off its place along each axis.
+With `--hanging`, skirts and strapless dresses alone: of random height, length, ease and flare, around the trunk's sections or
+around ovals; every other one lies in its place already, and only its unit and its axes are unknown.
+
 It is placed where it comes within 2 cm (mean over its vertices) of where it was made, in its unit; wrong where it is accepted
 elsewhere.
 """
@@ -29,10 +32,11 @@ from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.garment_placement import place
+from ncs_jax.prepare.hanging import ANGLES, RAYS, trunk_of
 from ncs_jax.prepare.joint_names import anatomy
 from ncs_jax.prepare.retarget import body_names
 
-__all__ = ["garments_of", "main", "tried"]
+__all__ = ["garments_of", "hung_on", "main", "tried"]
 
 UNITS = (1.0, 0.1, 0.01, 0.001, 0.0254, 0.3048)
 OFFSET, RIGHT = 0.3, 0.02  # m
@@ -105,13 +109,35 @@ def _hanging(x: np.ndarray, top: float, bottom: float, around: int = 48, rows: i
     return GarmentRecord(np.concatenate(rings).astype(np.float32), np.concatenate(faces).astype(np.int32))
 
 
+def hung_on(body: BodyRecord, rng: np.random.Generator, rows: int = 20) -> GarmentRecord:
+    """Return a skirt or a strapless dress of random height, length, ease and flare: sections or ovals, made wider."""
+    trunk, tall = trunk_of(body), float(np.ptp(body.vertices, axis=0).max())
+    joined = np.flatnonzero(np.diff(trunk.reach.mean(axis=1)) > 0.02)  # arms that are lifted
+    high = joined[0] if len(joined) else len(trunk.heights) - 1
+    top, length = trunk.heights[rng.integers(high // 6, high)], rng.uniform(0.18, 0.5) * tall
+    ease, flare, oval = rng.uniform(0.002, 0.02), rng.choice([0.0, 0.1, 0.3, 0.8]) / rows, rng.random() < 0.3
+    rings: list[np.ndarray] = []
+    wide, middle = np.zeros(ANGLES), np.zeros(2)
+    for y in np.linspace(top, top - length, rows):
+        if y >= trunk.heights[0]:
+            reach = trunk.reach[np.abs(trunk.heights - y).argmin()]
+            middle = middle if rings else reach @ RAYS * 2 / ANGLES
+            own = reach - RAYS @ middle
+            own = np.hypot(own[0] * RAYS[:, 0], own[ANGLES // 4] * RAYS[:, 1]) if oval else own
+        wide = np.maximum(wide + flare * length, own + ease)
+        rings.append(np.insert(wide[:, None] * RAYS + middle, 1, y, axis=1))
+    k, after = np.arange(ANGLES), (np.arange(ANGLES) + 1) % ANGLES
+    faces = [np.stack(t, axis=1) for r in range(rows - 1) for t in _quads(r * ANGLES, ANGLES, k, after)]
+    return GarmentRecord(np.concatenate(rings).astype(np.float32), np.concatenate(faces).astype(np.int32))
+
+
 def _quads(first: int, around: int, k: np.ndarray, after: np.ndarray):
     low = first + around
     return (first + k, first + after, low + k), (first + after, low + after, low + k)
 
 
-def _cast(shared: Path) -> Iterator[tuple[str, BodyRecord, GarmentRecord]]:
-    """Yield name, body and garment, at its place, of all that there is."""
+def _bodies(shared: Path) -> dict[str, BodyRecord]:
+    """Return the bodies that there are, by name."""
     packaged = io.read_body(ASSETS / "body.npz")
     other = replace(packaged, vertices=packaged.vertices * [1.1, 0.9, 1.1], joints=packaged.joints * [1.1, 0.9, 1.1])
     with tempfile.TemporaryDirectory() as folder:
@@ -119,11 +145,16 @@ def _cast(shared: Path) -> Iterator[tuple[str, BodyRecord, GarmentRecord]]:
         bodies = {"packaged": packaged, "glb": io.read_body(f"{folder}/body.glb")}
     if (shared / "smpl_research_only" / "body.npz").exists():
         bodies["smpl"] = io.read_body(shared / "smpl_research_only" / "body.npz")
+    return bodies
+
+
+def _cast(bodies: dict[str, BodyRecord], shared: Path) -> Iterator[tuple[str, BodyRecord, GarmentRecord]]:
+    """Yield name, body and garment, at its place, of all that there is."""
     for label, body in bodies.items():
         for name, garment in garments_of(body):
             yield f"{label} {name}", body, garment
     for name in ("tshirt", "skirt"):
-        yield f"packaged ncs:{name}", packaged, io.read_garment(ASSETS / f"{name}.npz")
+        yield f"packaged ncs:{name}", bodies["packaged"], io.read_garment(ASSETS / f"{name}.npz")
     if "smpl" in bodies:
         body = bodies["smpl"]
         for file in (shared / "smpl_research_only" / "tshirt.obj", *sorted((shared / "gaps_research_only").glob("*.obj"))):
@@ -139,12 +170,16 @@ def _at_home(garment: GarmentRecord, body: BodyRecord) -> GarmentRecord:
     return replace(garment, vertices=(garment.vertices + best).astype(np.float32))
 
 
-def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator) -> dict:
-    """Return how one garment is placed from a random unit, axis and offset: what came out, its error, m, and why not."""
-    unit, up, quarters = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)], int(rng.integers(4))
+def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator, *, stays: bool = False) -> dict:
+    """Return how one garment is placed from a random unit, axis and offset: what came out, its error, m, and why not.
+
+    stays: it is not turned and has no offset.
+    """
+    unit, up, quarters = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)], 0 if stays else int(rng.integers(4))
+    offset = np.zeros(3) if stays else rng.uniform(-OFFSET, OFFSET, 3)
     case = {"unit": unit, "up": up, "turn": 90 * quarters}
     quarter = np.linalg.matrix_power(np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]), quarters)
-    x = (garment.vertices @ quarter + rng.uniform(-OFFSET, OFFSET, 3)) @ TURNS[up].T / unit
+    x = (garment.vertices @ quarter + offset) @ TURNS[up].T / unit
     try:
         found = place("garment", replace(garment, vertices=x.astype(np.float32), weights=None), body)
     except InputError as error:
@@ -159,14 +194,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--hanging", action="store_true", help="skirts and strapless dresses alone")
     parser.add_argument("--shared", type=Path, default=Path("../shared/data"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    rng, cast, rows = np.random.default_rng(options.seed), list(_cast(options.shared)), []
+    rng, rows = np.random.default_rng(options.seed), []
+    bodies = _bodies(options.shared)
+    cast = list(_cast(bodies, options.shared))
     order = np.concatenate([rng.permutation(len(cast)) for _ in range(-(-options.cases // len(cast)))])
-    for case in order[: options.cases]:
+    for number, case in enumerate(order[: options.cases]):
         name, body, garment = cast[case]
-        row = {"garment": name, **tried(garment, body, rng)}
+        if options.hanging:
+            label = tuple(bodies)[number // 2 % len(bodies)]
+            name, body, garment = f"{label} hanging", bodies[label], hung_on(bodies[label], rng)
+        row = {"garment": name, **tried(garment, body, rng, stays=options.hanging and number % 2 == 0)}
         rows.append(row)
         error = "" if row["error"] is None else f"{1000 * row['error']:.0f} mm"
         print(

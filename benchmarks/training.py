@@ -1,6 +1,6 @@
 """What a training step costs on a scene, part by part, beside the least that it could cost on this machine.
 
-    python -m benchmarks.training [SCENE] [--repeats 7] [--quick] [--json FILE]
+    python -m benchmarks.training [SCENE] [--repeats 7] [--batches 32 128 512] [--quick] [--json FILE]
 
 Every part is timed inside one compiled loop, as it stands in the scan of a training, on the poses of one batch after some steps
 of training: its value and its derivative, for all poses of the batch. Indented rows are parts of the row above them;
@@ -8,6 +8,8 @@ of training: its value and its derivative, for all poses of the batch. Indented 
 of steps. The least is the time of the matrix products and of the bytes that a part cannot avoid (`benchmarks/work.py`), at the
 rates that this run measures; other arithmetic is not counted, so an energy's least is that of reading positions and writing
 forces.
+
+`--batches` instead measures whole steps alone, with so many windows each, and how many windows a second that makes.
 """
 
 from __future__ import annotations
@@ -188,11 +190,27 @@ def optimiser(assembly: Assembly, state: TrainState, ends, pairs) -> tuple:
     return update, (state, given), model, whole
 
 
+def by_batch(assembly: Assembly, sizes: Sequence[int], repeats: int, count: int) -> dict:
+    """Whole steps, `count` in a program, with each number of windows."""
+    rows = {}
+    for size in sizes:
+        training = replace(assembly.scene.training, batch=size)
+        resized = replace(assembly, scene=replace(assembly.scene, training=training))
+        several, held = steps(resized, count)
+        seconds = timed(several, repeats, count)
+        needed = work.training(resized, held[0].params, np.asarray(batch(resized, 1)[0][0]))["step"]
+        speed = {"windows/s": size / seconds["median"], "peak MB": peak_memory() >> 20}
+        rows[f"step, batch {size}"] = {"seconds": seconds, "work": needed, **speed}
+    return {"vertices": len(assembly.model.garment.mesh.rest), "window": assembly.scene.training.window, "rows": rows}
+
+
 def benchmark(options) -> dict:
-    """Measure a scene's training step and its parts."""
+    """Measure a scene's training step and its parts, or whole steps by the size of the batch."""
     assembly = ready(read(options.scene))
     model, whole = assembly.model, assembly.track
     rounds, count = (2, 2) if options.quick else (ROUNDS, CHUNK)
+    if options.batches:
+        return by_batch(assembly, [round(size) for size in options.batches], options.repeats, count)
     several, held = steps(assembly, count)
     seconds = {"step": timed(several, options.repeats, count)}
     peak = peak_memory()
@@ -227,6 +245,8 @@ def benchmark(options) -> dict:
 def show(figures: dict) -> str:
     """The table of a step's parts, and what they come to."""
     rows = figures["rows"]
+    if "step" not in rows:
+        return clocks(rows, ("windows/s", "peak MB"))
     parts = sum(row["seconds"]["median"] for name, row in rows.items() if DEPTH.get(name) == 1)
     indented = {"  " * DEPTH.get(name, 2) + name: row for name, row in rows.items()}
     text = f"the parts of a step come to {1000 * parts:.4g} ms, the step takes {1000 * rows['step']['seconds']['median']:.4g}"
@@ -235,7 +255,10 @@ def show(figures: dict) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
-    return run(__doc__, benchmark, show, arguments, repeats=(7, "timed calls of each part"))
+    return run(
+        __doc__, benchmark, show, arguments,
+        repeats=(7, "timed calls of each part"), batches=((), "numbers of windows, for whole steps alone"),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 
 # Nearly all of the time goes into compiling programs that then run for milliseconds: code that is compiled four times
 # faster, and runs slower. `make test-all` and `make thorough` compile as users do, and so do tests that are about that.
-HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 12  # from 0.12 on there is nothing else, and no such flag
+HAS_EMITTERS = int(version("jaxlib").split(".")[1]) < 11  # from 0.11.2 on there is nothing else, and no such flag
 PLAIN_CODE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"  # XLA counts the same
 FAST = f"{PLAIN_CODE} --xla_cpu_parallel_codegen_split_count=1"  # the cores have work enough, and what is not split costs less
 FAST += " --xla_cpu_use_fusion_emitters=false" * HAS_EMITTERS

@@ -62,6 +62,14 @@ def test_training(tmp_path, capsys):
     assert "no such folder" in capsys.readouterr().err
 
 
+def test_training_by_batch(tmp_path, capsys):
+    rows = figures(training, tmp_path, "--repeats", "1", "--batches", "6")["rows"]
+    assert list(rows) == ["step, batch 6"]
+    row = rows["step, batch 6"]
+    assert row["windows/s"] == pytest.approx(6 / row["seconds"]["median"])
+    assert "windows/s" in capsys.readouterr().out
+
+
 def _fresh(folder, text=SCENE):
     assembly = assemble(load_scene(write_scene(folder, text)))
     ends = np.arange(min(4, len(assembly.track.start)), dtype=np.int32)
@@ -122,13 +130,13 @@ def test_frames_that_windows_share_count_once(tmp_path):
 
 
 def test_inference(tmp_path, capsys):
-    rows = figures(inference, tmp_path, "--repeats", "2", "--rank", "2")["rows"]
+    rows = figures(inference, tmp_path, "--repeats", "2", "--rank", "2", "--characters", "1", "3")["rows"]
     smaller = rows["streamed, rank 2, bfloat16"]
     assert {
         "whole motion, float32, a frame",
         "whole motion, rank 2, bfloat16, a frame",
-        "4 at once, float32, each",
-        "4 at once, rank 2, bfloat16, each",
+        "3 at once, float32, each",
+        "3 at once, rank 2, bfloat16, each",
     } < set(rows)
     assert rows["streamed, float32"]["mm max"] == 0 < smaller["mm mean"] < smaller["mm max"] < 20
     assert "frames/s" in capsys.readouterr().out

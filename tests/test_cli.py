@@ -447,6 +447,13 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     np.testing.assert_allclose(quick["strain_mean"], rows["strain_mean"][::every].mean(), rtol=1e-3)
     np.testing.assert_allclose(quick["penetrating"], rows["penetrating"][::every].mean(), atol=1e-6)
     np.testing.assert_allclose(quick["depth_max"], rows["depth_max"][::every].max(), atol=1e-2)
+    deepest = np.maximum(rows["depth_max"], rows["middle_depth_max"])[::every]
+    bare, worst = int((deepest > 1e-3).sum()), every * int(deepest.argmax())
+    assert bare > 0 and (quick["bare"], quick["barest"], quick["measured"]) == (bare, worst, len(deepest))
+    assert (
+        f"skin shows in {bare} of {len(deepest)} frames that were measured, most in frame {worst}, {deepest.max():.1f} mm"
+        in text
+    )
     page = (out / "preview.html").read_text()
     assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
 
@@ -534,6 +541,9 @@ def test_animate_with_the_body(run_folder, tmp_path, capsys):
     theirs = skinned(tmp_path / "a.glb", np.arange(24) / run.assembly.model.fps)
     ours = body_vertices(run.assembly.body, run.motion(run.assembly.scene.motion.files[0]))
     assert np.abs(ours - theirs).max() < 1e-5
+    data = (tmp_path / "a.glb").read_bytes()
+    parts = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert [mesh["name"] for mesh in parts["meshes"]] == ["cloth", "body"]  # as their files are
     assert main(["animate", str(folder), "--out", str(tmp_path / "a.usdc"), "--body"]) == 2
     one_line(capsys, ["a.usdc", ".glb", "body"])
 

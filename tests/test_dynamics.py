@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ncs_jax.geometry.skinning import blend, skin
-from ncs_jax.metrics.motion import MEASURES, compare_motion, hem, measure_motion, stops, unposed
+from ncs_jax.metrics.motion import MEASURES, compare_dynamics, compare_motion, hem, measure_motion, stops, unposed
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
@@ -98,4 +98,20 @@ def test_beside_a_reference(tmp_path):
     assert half["distance"] == pytest.approx(1000 * np.abs(swing[:, 0]).mean() / 2, rel=1e-6)
     rigid = compare_motion(model, moved(model, track, 0 * swing), reference, track)
     assert rigid["dynamic_share"] == pytest.approx(0, abs=1e-9)
-    assert [*measure_motion(model, reference, track), "gain", *half] == list(MEASURES)
+    parts = compare_dynamics(reference, reference, reference, reference)
+    assert [*measure_motion(model, reference, track), "gain", *half, *parts] == list(MEASURES)
+
+
+def test_parts_beside_those_of_a_reference():
+    """Static error, direction and size of the dynamic part are told apart."""
+    rng = np.random.default_rng(0)
+    static, true, other = rng.normal(size=(3, 40, 30, 3))
+    other -= true * np.sum(other * true) / np.sum(true * true)
+    other *= np.linalg.norm(true) / np.linalg.norm(other)  # as large, and unrelated
+    offset = np.array([0.003, 0.0, 0.004])
+    found = compare_dynamics(static + offset + 0.5 * true, static + offset, static + true, static)
+    assert found == pytest.approx({"static_distance": 5, "dynamic_correlation": 1, "dynamic_factor": 2})
+    found = compare_dynamics(static + true + other, static, static + true, static)
+    assert found == pytest.approx({"static_distance": 0, "dynamic_correlation": 0.5**0.5, "dynamic_factor": 0.5})
+    nothing = compare_dynamics(static, static, static + true, static)
+    assert np.isnan(nothing["dynamic_correlation"]) and np.isnan(nothing["dynamic_factor"])

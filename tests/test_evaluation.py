@@ -13,13 +13,14 @@ from ncs_jax import InputError
 from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.pairs import groups_from
 from ncs_jax.energies.contact.surface import surface_from
-from ncs_jax.metrics.quality import BLOCK, _depth, measure, summarise, winding_number
+from ncs_jax.metrics.penetration import CLEAR, depths_in, depths_on_host
+from ncs_jax.metrics.quality import BLOCK, measure, summarise
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene, scene_from
 
 from .scenes import SCENE, grid, write_scene
-from .shapes import ball, tube
+from .shapes import tube
 
 
 def assembled(folder, **physics):
@@ -87,18 +88,6 @@ def test_skin_between_vertices(assembly):
     assert summarise(rows)["middle_depth_max"] == rows["middle_depth_max"].max()
 
 
-def test_the_winding_number_is_one_within_a_closed_surface_and_what_is_left_of_it_within_an_open_one(rng):
-    vertices, faces = ball(3, 0.1)
-    away = rng.normal(size=(20, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    triangles = jnp.asarray(vertices[faces])
-    turns = jax.jit(winding_number)
-    np.testing.assert_allclose(turns(0.09 * away, triangles), 1, atol=1e-6)
-    np.testing.assert_allclose(turns(0.11 * away, triangles), 0, atol=1e-6)
-    half = vertices[faces].mean(axis=1) @ [0.1, 0.7, 0.2] > 0  # of a surface that is the same seen from the other side
-    np.testing.assert_allclose(turns(np.zeros((1, 3)), triangles[half]), 0.5, atol=1e-6)
-
-
 def test_a_crease_of_a_garment_below_that_is_folded_too_far_does_not_turn_outside_into_inside():
     """A sleeve with a ridge whose flanks pass through each other: what is 2 cm before its tip is not inside."""
     around, rings, tip = 24, 14, 6
@@ -112,12 +101,15 @@ def test_a_crease_of_a_garment_below_that_is_folded_too_far_does_not_turn_outsid
     out = np.array([np.sin(angle * tip), 0, np.cos(angle * tip)])
     points = np.array([0.15 * out, -0.105 * out, -0.095 * out, [0, 0, 0]]) + [0, 0.24, 0]
     surface = surface_from(points, np.asarray(body), faces)
-    depth = jax.jit(_depth, static_argnums=3)
+    depth = jax.jit(depths_in, static_argnums=3)
     single, layered = (np.asarray(depth(jnp.asarray(points, jnp.float32), body, surface, worn)) for worn in (False, True))
     assert single[0] > 0.015, "by the pseudo-normal alone it is inside"
     np.testing.assert_allclose(layered[0], -single[0], rtol=1e-6)
     np.testing.assert_allclose(layered[1:], single[1:])
     assert layered[1] < 0 < layered[2] < layered[3]
+    for worn, found in ((False, single), (True, layered)):
+        host = depths_on_host(points[None], np.asarray(body)[None], faces, layered=worn)[0]
+        np.testing.assert_allclose(host, np.maximum(found, -CLEAR), atol=1e-6)
 
 
 def test_a_free_fall_is_in_balance(tmp_path):

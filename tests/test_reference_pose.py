@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +13,17 @@ from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.packaged import packaged
+from ncs_jax.prepare.built_pose import build_pose
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.prepare.posture_checks import posture_faults
+from ncs_jax.prepare.retarget import paired
+from ncs_jax.prepare.scene_checks import _uncertain
 from ncs_jax.scene.spec import MotionSpec
 from tests.test_retarget import figure, forward
 from tools.check_inputs import main as check_inputs
 
 FRAMES = 48
+UP = np.array([0, 1.0, 0])
 TIPPED = Rotation.from_rotvec([0.6, 0, 0]).as_matrix()
 
 
@@ -158,6 +163,49 @@ def test_a_zero_pose_that_is_a_moment_of_the_motion_is_not_taken_for_standing(bo
     assert "a moment of a movement" in " ".join(taken[2].notes) and "degrees; motion.rest" in " ".join(taken[2].notes)
     short = replace(other, poses=other.poses[:2], translation=other.translation[:2])  # too few frames to know better
     assert not any("reference pose" in note for note in retarget_to_body(short, body, MotionSpec()).notes)
+
+
+def bent(motion: MotionRecord, part: str, degrees: float, others: tuple[str, ...] = ()) -> MotionRecord:
+    """The motion with a joint that bends ahead in all frames, and others that bend back by as much."""
+    poses = motion.poses.copy()
+    for j, (_, name) in enumerate(figure("mixamo")[3]):
+        by = degrees * ((name == part) - (name in others))
+        poses[:, j] = (Rotation.from_euler("x", by, degrees=True) * Rotation.from_rotvec(motion.poses[:, j])).as_rotvec()
+    return replace(motion, poses=poses)
+
+
+@pytest.mark.parametrize(("part", "others", "degrees"), [("spine", (), 25), ("hips", ("thigh",), 20), ("foot", (), 50)])
+def test_whoever_bends_in_all_frames_is_not_straight(body, part, others, degrees):
+    """A trunk, a pelvis, feet on tiptoe: what no skeleton is at rest is not taken for standing, and what is unsure is told."""
+    motion = bent(walk(), part, degrees, others)
+    turns = forward(np.asarray(motion.joints), np.asarray(motion.parents), motion)[0][4]
+    right, taken = driven(motion, body), driven(told_since(motion, turns), body)
+    joint = {"spine": "Spine1", "hips": "Hips", "foot": "LeftFoot"}[part]
+    told = taken[2].uncertain
+    off = apart(right, taken)[0][body.joint_names.index(joint)]
+    assert off < 0.6 * degrees and off < 3 * told[{"spine": "chest", "hips": "hips", "foot": "feet"}[part]]
+    assert told["head"] >= 10 and not right[2].uncertain
+    (risk,) = _uncertain({"a.bvh": right[2], "b.bvh": taken[2]})
+    assert f"head {told['head']:.0f}" in risk.value and risk.value.endswith("in b.bvh") and "motion.rest" in risk.mend
+
+
+def test_recordings_whose_t_pose_is_withheld(body):
+    """Of 44 recordings of one skeleton seven have its T-pose as zero pose: bones of the others pitch as they do there."""
+    folder = Path(__file__).parents[2] / "shared" / "data" / "cmu_mocap_bvh"
+    if not folder.is_dir():
+        pytest.skip("needs the recordings of ../shared/data/cmu_mocap_bvh")
+    rest, off = np.asarray(io.read_motion(folder / "007_03.bvh").joints), []
+    for name in ("001_01", "002_02", "005_02", "005_06", "005_17", "006_04", "006_08", "006_12", "007_01"):
+        motion = io.read_motion(folder / f"{name}.bvh")
+        joints, names = np.asarray(motion.joints), motion.joint_names
+        turns, _ = build_pose(motion, paired(motion, body, {})[0], "y", moment=True)
+        start = [names.index(n) for n in ("Hips", "Spine2", "Neck", "LeftFoot", "RightFoot")]
+        end = [names.index(n) for n in ("Spine", "Neck", "Head", "LeftToeBase", "RightToeBase")]
+        ours = np.einsum("jab,jb->ja", turns[start], joints[end] - joints[start])
+        theirs = rest[end] - rest[start]
+        off.append([np.degrees(np.arctan2(np.linalg.norm(v[..., [0, 2]], axis=-1), v[..., 1])) for v in (ours, theirs)])
+    error = np.abs(np.diff(off, axis=1)[:, 0])
+    assert (np.median(error, axis=0) < [11, 6, 10, 5, 5]).all() and (error.max(axis=0) < [15, 10, 26, 8, 8]).all(), error
 
 
 def test_what_has_no_reference_pose_is_refused(rng, body):
@@ -364,3 +412,25 @@ def test_the_tool_that_tries_folders_tells_what_is_off(tmp_path, body, capsys):
     capsys.readouterr()
     assert check_inputs([str(tmp_path)]) == 1
     assert "limbs to 0.00 degrees" in (told := capsys.readouterr().out) and "not all pass" in told
+
+
+def test_the_tool_compares_no_places_above_joints_that_one_file_lacks(tmp_path, body, capsys):
+    """A second joint in the neck moves the head's place, which is told and not judged; which way the head looks is judged."""
+    motion = walk(size=100.0)
+    motion = replace(motion, translation=motion.translation * 100)
+    head = next(j for j, n in enumerate(motion.joint_names) if n.endswith("Head"))
+    turns = 0.3 * np.sin(np.arange(FRAMES))[:, None] * [1.0, 0, 0]
+    names = (*motion.joint_names[:head], "mixamorig:Neck1", *motion.joint_names[head:])
+    parents = np.asarray(motion.parents)
+    above = np.insert(np.where(parents >= head, parents + 1, parents), head, parents[head]).astype(np.int32)
+    above[head + 1] = head
+    joints = np.insert(np.asarray(motion.joints), head, np.asarray(motion.joints)[[parents[head], head]].mean(axis=0), axis=0)
+    path = {names[0]: joints[0] + motion.translation}
+    (tmp_path / "twin.bvh").write_text(bvh_text(motion, path))
+    for undone, code in ((-turns, 0), (0 * turns, 1)):  # the head turns back as far as the neck turns, or goes with it
+        poses = np.insert(motion.poses, head, turns, axis=1)
+        poses[:, head + 1] = (Rotation.from_rotvec(undone) * Rotation.from_rotvec(motion.poses[:, head])).as_rotvec()
+        other = replace(motion, poses=poses, joint_names=names, parents=above, joints=joints)
+        (tmp_path / "x.bvh").write_text(bvh_text(other, path))
+        assert check_inputs([str(tmp_path)]) == code
+        assert "places not compared, as the files differ below them: Head" in capsys.readouterr().out

@@ -296,7 +296,7 @@ def test_joints_that_turn_and_are_not_read_are_warned_of(tmp_path, plain_jax):
     one = assemble(replace(scene, body=replace(scene.body, joints=("0",))))
     begun = Run(one, initial_state(one.model, one.network, 0).params)
     with pytest.warns(InputWarning, match="does not read joints that turn in the motions: 1;"):
-        found, _ = assemble_run(scene, None, None, begun, terms=(), network=None)
+        found, _ = assemble_run(scene, None, None, begun, None, assemble)
     assert found.prepared.inputs.tolist() == [0]
 
 

@@ -20,7 +20,9 @@ from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.geometry.surface_distance import closest_on_surface, distance_and_direction, signed_distance
 from ncs_jax.prepare.kept import kept
 from ncs_jax.runs.run import assemble
+from ncs_jax.scene.model import RitzModes
 from ncs_jax.scene.spec import load_scene
+from ncs_jax.training.programs import Programs
 
 from .scenes import SCENE, write_scene
 
@@ -85,6 +87,43 @@ def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, c
     assemble(scene)
     said = capsys.readouterr().err
     assert ("ncs_jax: finding the garment's vibrations" in said) == bool(said) == (person != "nobody"), said
+
+
+def test_a_program_is_compiled_once_and_ahead_for_arguments_of_which_the_shapes_are_known():
+    traced = []
+
+    def program(a, b):
+        traced.append(a["x"].shape)
+        return a["x"] + b
+
+    programs, two, three = Programs(), ({"x": jnp.ones(2)}, 1.0), ({"x": jnp.ones(3)}, 1.0)
+    leaves, structure = jax.tree.flatten(two)
+    programs.begin("sum", program, [jax.ShapeDtypeStruct((2,), leaves[0].dtype), 1.0], structure, reused=True)
+    assert traced == [(2,)]
+    found = programs.ready("sum", program, *two, reused=True)
+    assert programs.ready("sum", program, *two, reused=True) is found and traced == [(2,)]
+    np.testing.assert_array_equal(found(*leaves), [2, 2])
+    assert leaves[0].is_deleted()
+    np.testing.assert_array_equal(programs.ready("sum", program, *three)(*jax.tree.leaves(three)), [2, 2, 2])
+    assert traced == [(2,), (3,)]
+
+
+def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path, plain_jax, monkeypatch):
+    """No vibration is really looked for. Else training would compile its steps twice."""
+
+    def found(model, track, count):
+        draw = np.random.default_rng(0).normal(size=(len(model.basis), 3, count)) / 100
+        return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), jnp.eye(count, dtype=jnp.float32))
+
+    monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
+    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    scene, begun = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))), []
+    whole = assemble(scene, ahead=begun.append)
+    assert not np.any(begun[0].model.vibrations.directions) and whole.model.vibrations.directions.size
+    assert (begun[0].network, begun[0].scene) == (whole.network, whole.scene)
+    flat = [jax.tree.flatten((a.model, a.training_features)) for a in (begun[0], whole)]
+    kinds = [([(leaf.shape, leaf.dtype) for leaf in leaves], structure) for leaves, structure in flat]
+    assert kinds[0] == kinds[1]
 
 
 def ball(rows=9, around=14):

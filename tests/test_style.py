@@ -43,6 +43,7 @@ LONG_MODULES: dict[str, str] = {}  # over 450 lines, and why
 LONG_FUNCTIONS: dict[str, str] = {}  # over 60 lines, and why
 MANY_PARAMETERS: dict[str, str] = {  # over 7, and why
     "runs.train.train": "what users call: a scene and a folder, and options by keyword",
+    "io.animation.animation.write_animation": "what users call: a moving mesh, and by keyword what some formats hold",
 }
 
 
@@ -257,6 +258,21 @@ def test_what_is_forbidden(name):
     assert not modules & {"pickle", "cPickle", "dill", "cloudpickle", "joblib"}
     if room(name) != "cli":  # which are a program of its own
         assert not re.search(r"jax\.config\.update|\bprint\(", path.read_text(encoding="utf-8"))
+
+
+PRODUCTS = re.compile(r"jnp\.(dot|vdot|inner|einsum|matmul|tensordot)$")
+LEARNED = {"outward", "_outward_backward"}  # of layers, as fast as the device has them
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if room(name) in NUMERIC])
+def test_a_product_of_positions_says_its_precision(name):
+    """Left to itself, a GPU keeps 10 bits of each factor."""
+    source = tree(MODULES[name])
+    learned = [n for n in ast.walk(source) if isinstance(n, ast.FunctionDef) and n.name in LEARNED]
+    aside = {id(n) for function in learned for n in ast.walk(function)}
+    for node in ast.walk(source):
+        if isinstance(node, ast.Call) and PRODUCTS.search(ast.unparse(node.func)) and id(node) not in aside:
+            assert "precision" in {k.arg for k in node.keywords}, f"line {node.lineno}: {ast.unparse(node)}"
 
 
 @pytest.mark.parametrize("path", TESTS, ids=lambda p: p.stem)

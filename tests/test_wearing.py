@@ -1,28 +1,12 @@
-"""How a body and a garment meet: what a surface encloses; and the benchmark that counts how garments are placed."""
+"""How a body and a garment meet: the benchmark that counts how garments are placed."""
 
 import json
 from types import SimpleNamespace
 
 import numpy as np
-import trimesh
 
 from ncs_jax import InputError, io
 from ncs_jax.io.packaged import ASSETS
-from ncs_jax.prepare.wearing import _enclosed, _even
-
-
-def test_points_on_a_surface_tell_what_it_encloses():
-    """Two balls that touch, as thighs do: between them the nearest skin is the other one's; a hole does not matter."""
-    balls = [trimesh.creation.icosphere(3, 0.1).apply_translation([side * 0.101, 0, 0]) for side in (-1, 1)]
-    both = trimesh.util.concatenate(balls)
-    faces = both.faces[both.triangles_center[:, 1] < 0.095]  # each with a hole on top
-    assert len(faces) < len(both.faces)
-    points, normals, area = _even(np.asarray(both.vertices), np.asarray(faces), 4000)
-    x = np.array(
-        [[0.101, 0, 0], [-0.101, 0, 0], [0.02, 0, 0], [0.17, 0, 0], [0, 0.05, 0], [0, 0, 0.15], [0.23, 0, 0], [1, 1, 1]]
-    )
-    np.testing.assert_array_equal(_enclosed(x, points, normals, area), [True] * 4 + [False] * 4)
-    np.testing.assert_array_equal(_enclosed(x[:4], points, -normals, area), [False] * 4)  # inside out, it encloses nothing
 
 
 def test_the_benchmark_of_placing_counts_what_came_home(tmp_path, monkeypatch, capsys):

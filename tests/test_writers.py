@@ -152,6 +152,8 @@ def test_glb_plays_every_frame(tmp_path):
     io.write_animation(tmp_path / "a.glb", x, faces, 24)
     glb = Gltf((tmp_path / "a.glb").read_bytes())
     np.testing.assert_array_equal(glb.accessor(glb.primitive["indices"]).reshape(-1, 3), faces)
+    keys = glb.accessor(glb.json["animations"][0]["samplers"][0]["input"])
+    np.testing.assert_array_equal(keys[:, 0], (np.arange(len(x)) / 24).astype(np.float32))
     for t in range(len(x)):
         assert np.abs(glb.at(t / 24, "POSITION") - x[t]).max() < 1e-6
         np.testing.assert_allclose(glb.at(t / 24, "NORMAL"), vertex_normals(x[t], faces), atol=1e-6)

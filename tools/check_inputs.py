@@ -6,7 +6,9 @@ Below FOLDER, each file is read as all that its suffix may be, and what comes of
 Each motion drives the packaged body, in all its frames. Compared are
 
 - with twin.* of the same folder, or else with the folder's first motion, if they have as many frames but for a first one, which
-  may be a T-pose: the largest distance of a joint, and the largest angle of trunk, collars and feet;
+  may be a T-pose: the largest distance of a joint, and the largest angle of trunk, head, collars and feet. Where one file has
+  more joints in its spine or neck than the other, these joints bend differently in between, so the places above them are no
+  truth, and are left out by name; which way the head looks is one still;
 - with the .bvh itself, read and posed here in a few lines: the largest angle between a limb's bone on the character and the one
   that drives it.
 
@@ -28,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from ncs_jax import io
 from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.scene.spec import MotionSpec, load_scene
@@ -37,7 +40,7 @@ __all__ = ["bvh_places", "main", "posed"]
 CLOSE = 0.001, 2.0  # m and degrees
 BONES = [(f"{side}{a}", f"{side}{b}") for side in ("Left", "Right")
          for a, b in (("Arm", "ForeArm"), ("ForeArm", "Hand"), ("UpLeg", "Leg"), ("Leg", "Foot"))]  # fmt: skip
-TRUNK = re.compile(r"Hips|Spine|LowerBack|Neck|Shoulder|Foot$")
+TRUNK = re.compile(r"Hips|Spine|LowerBack|Neck|Head|Shoulder|Foot$")
 KINDS: dict[str, Callable] = {"body": io.read_body, "garment": io.read_garment, "motion": io.read_motion}
 SUFFIXES = {
     "body": {".npz", ".glb", ".gltf", ".vrm", ".fbx", ".obj"},
@@ -111,18 +114,21 @@ def posed(body: BodyRecord, motion: MotionRecord) -> Driven:
     return Driven(turns, places, motion.driven, motion.notes)
 
 
-def apart(one: Driven, other: Driven, names: tuple[str, ...]) -> tuple[float, str, float, str]:
+def apart(one: Driven, other: Driven, body: BodyRecord) -> tuple[float, str, float, str, list[str]]:
     """Return the largest distance of a joint that both drive, m, the largest angle of the trunk, degrees, and where they are.
 
-    Compared are the last frames that both have.
+    Compared are the last frames that both have. Last are the joints whose places are not compared, as below them is one that
+    only one motion drives.
     """
-    frames = min(len(one.places), len(other.places))
+    names, frames = body.joint_names, min(len(one.places), len(other.places))
     both = [j for j, n in enumerate(names) if n in one.by and n in other.by]
-    far = np.linalg.norm(one.places[-frames:] - other.places[-frames:], axis=-1).max(axis=0)[both]
+    alike = [j for j in both if all((names[k] in one.by) == (names[k] in other.by) for k in path_to_root(body.parents, j))]
+    far = np.linalg.norm(one.places[-frames:] - other.places[-frames:], axis=-1).max(axis=0)[alike]
     trunk = [j for j in both if TRUNK.search(names[j])]
     turn = np.swapaxes(one.turns[-frames:, trunk], -1, -2) @ other.turns[-frames:, trunk]
     angle = np.degrees(Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude()).reshape(turn.shape[:2]).max(axis=0)
-    return float(far.max()), names[both[int(far.argmax())]], float(angle.max()), names[trunk[int(angle.argmax())]]
+    where = names[alike[int(far.argmax())]], names[trunk[int(angle.argmax())]]
+    return float(far.max()), where[0], float(angle.max()), where[1], [names[j] for j in both if j not in alike]
 
 
 def limbs_apart(driven: Driven, own: dict[str, np.ndarray], names: tuple[str, ...]) -> tuple[float, str]:
@@ -189,8 +195,9 @@ def _compare(folder: Path, motions: dict[str, MotionRecord], body: BodyRecord) -
             good &= angle < CLOSE[1]
         base = next((n for n, d in found.items() if abs(len(d.places) - len(driven.places)) <= (n[:5] == "twin.")), None)
         if base is not None:
-            far, joint, angle, bone = apart(found[base], driven, body.joint_names)
-            line.append(f"from {base}: {1000 * far:.2f} mm ({joint}), trunk, collars and feet {angle:.2f} degrees ({bone})")
+            far, joint, angle, bone, left_out = apart(found[base], driven, body)
+            line.append(f"from {base}: {1000 * far:.2f} mm ({joint}), trunk, head, collars, feet {angle:.2f} degrees ({bone})")
+            line += [f"places not compared, as the files differ below them: {', '.join(left_out)}"] if left_out else []
             good &= far < CLOSE[0] and angle < CLOSE[1]
         found[name] = driven
         line += [n for n in driven.notes if "reference pose" in n or "turned" in n or "carries" in n or "shape of" in n]

@@ -78,7 +78,10 @@ def animate(options) -> int:
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     garment = run.assembly.garment
     fps = run.assembly.model.fps
-    io.write_animation(options.out, vertices, garment.faces, fps, rest=garment.vertices, uv=garment.uv, worn_by=worn_by)
+    names = arguments.mesh_names(run.assembly.scene)
+    io.write_animation(
+        options.out, vertices, garment.faces, fps, rest=garment.vertices, uv=garment.uv, worn_by=worn_by, names=names
+    )
     print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
     if suffix in (".pc2", ".mdd"):
         print(arguments.BLENDER)

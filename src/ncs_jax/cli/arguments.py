@@ -23,6 +23,7 @@ __all__ = [
     "command",
     "finite",
     "hosts",
+    "mesh_names",
     "positive",
     "seed",
     "whole",
@@ -78,6 +79,12 @@ def body_table(options, folder: Path) -> str:
     lines = [f"[body]\nfile = {json.dumps(file)}"]
     lines += [f"{name} = {json.dumps(value)}" for name in ("part", "betas") if (value := getattr(options, name))]
     return "\n".join(lines)
+
+
+def mesh_names(scene) -> tuple[str, str]:
+    """Return what garment and body of a scene are called where a file names its meshes: as their own files, if these differ."""
+    garment, body = (Path(part.file.removeprefix("ncs:")).stem for part in (scene.garment, scene.body))
+    return (garment, body) if garment != body else ("garment", "body")
 
 
 def positive(text: str) -> float:

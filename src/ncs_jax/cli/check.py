@@ -82,6 +82,8 @@ def tell(label: str, text: str) -> None:
 
 def _tell_scene(setting: Setting, *, automatic: bool) -> None:
     """Print what the garment, the body and the physics are, and the network's cell, which may be chosen by itself."""
+    import numpy as np
+
     from ncs_jax.energies.terms import NAMES
     from ncs_jax.prepare.garment_checks import summarise_surface
     from ncs_jax.prepare.joint_names import listed
@@ -91,8 +93,8 @@ def _tell_scene(setting: Setting, *, automatic: bool) -> None:
     joints = [names[model.source_joints[j]] if names else str(model.source_joints[j]) for j in model.inputs]
     terms = model.terms
     on = [name for name in NAMES if getattr(terms, name, None)] + [term.__name__ for term in terms.own]
-    mass = float((mesh.vertex_area * model.material.density).sum())
-    size = f"{float(mesh.face_area.sum()):.3f} m^2, {mass:.3f} kg, edges {1000 * float(mesh.edge_length.mean()):.1f} mm"
+    area, edges = np.asarray(mesh.face_area, np.float64).sum(), np.asarray(mesh.edge_length, np.float64)  # no program for a sum
+    size = f"{area:.3f} m^2, {area * float(model.material.density):.3f} kg, edges {1000 * edges.mean():.1f} mm"
     tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
     record = setting.garment
     parts = summarise_surface(record.vertices, record.faces)

@@ -46,7 +46,20 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
     inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
     never += f", one frame in {quantities['every']:.0f}" if quantities["every"] > 1 else ""
     print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
+    _say_bare(quantities, run.assembly.scene.physics.collision.thickness)
     return quantities
+
+
+def _say_bare(quantities: dict[str, float], thickness: float) -> None:
+    """Print in how many frames skin is outside the cloth, where it is worst, and what mends it."""
+    if "bare" not in quantities:
+        return
+    deepest = max(quantities["depth_max"], quantities["middle_depth_max"])
+    frames = f"{quantities['bare']:.0f} of {quantities['measured']:.0f} frames that were measured"
+    print(
+        f"  skin shows in {frames}, most in frame {quantities['barest']:.0f}, {deepest:.1f} mm outside the cloth: train longer"
+    )
+    print(f"  (--resume), on motions like this one, or with physics.collision.thickness above {1000 * thickness:g} mm")
 
 
 def _is_trained_on(files: Sequence[str], name: str) -> bool:

@@ -49,7 +49,8 @@ def simulate(options) -> int:
 
         result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment
-    io.write_animation(options.out, result.vertices, garment.faces, result.fps, rest=garment.vertices, uv=garment.uv)
+    names, x, fps = arguments.mesh_names(scene), result.vertices, result.fps
+    io.write_animation(options.out, x, garment.faces, fps, rest=garment.vertices, uv=garment.uv, names=names)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
     if suffix in (".pc2", ".mdd"):

@@ -97,6 +97,7 @@ class MotionRecord:
         origin: the number in its file of the first frame, and how many of the file's frames make one of these.
         driven: of a motion that was retargeted, the source's joint for each joint of the body that one drives.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
+        uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees.
     """
 
     poses: np.ndarray
@@ -112,6 +113,7 @@ class MotionRecord:
     source: SkeletonPoses | None = None
     bones: tuple[str, ...] = ()
     undriven: dict[str, str] = field(default_factory=dict)
+    uncertain: dict[str, float] = field(default_factory=dict)
     origin: tuple[int, float] = (0, 1.0)
     driven: dict[str, str] = field(default_factory=dict)
 

@@ -13,7 +13,7 @@ from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_rest
 
-__all__ = ["MEASURES", "carried", "compare_motion", "hem", "measure_motion", "stops", "unposed"]
+__all__ = ["MEASURES", "carried", "compare_dynamics", "compare_motion", "hem", "measure_motion", "stops", "unposed"]
 
 # name: unit and what it is
 MEASURES = {
@@ -26,6 +26,9 @@ MEASURES = {
     "stopped_share": ("", "the same of the frames after a stop"),
     "hem_correlation": ("", "of the hem's path as seen from the body with the reference's"),
     "distance": ("mm", "mean distance of the vertices to those of the reference"),
+    "static_distance": ("mm", "the same of alpha = 0 to the reference without inertia"),
+    "dynamic_correlation": ("", "of what alpha = 1 adds to alpha = 0 with what inertia adds to the reference"),
+    "dynamic_factor": ("", "by which that is to be multiplied to come nearest: below 1 it is too large, above too small"),
 }
 
 HEM = 0.045  # of the vertices, the lowest ones
@@ -139,7 +142,7 @@ def measure_motion(model: Model, vertices, track: MotionFeatures) -> dict[str, f
 
 
 def compare_motion(model: Model, vertices, reference, track: MotionFeatures) -> dict[str, float]:
-    """Compare an animation (frames, verts, 3) with another of the same garment and motion: the last four of `MEASURES`."""
+    """Compare an animation (frames, verts, 3) with another of the same garment and motion: `dynamic_share` to `distance`."""
     u, other = unposed(model, vertices, track), unposed(model, reference, track)
     fps, low = model.fps, hem(model)
 
@@ -158,3 +161,27 @@ def compare_motion(model: Model, vertices, reference, track: MotionFeatures) -> 
     apart = np.asarray(vertices, np.float64) - np.asarray(reference, np.float64)
     found["distance"] = 1000 * float(np.linalg.norm(apart, axis=-1).mean())
     return found
+
+
+def compare_dynamics(moving, still, reference, static_reference) -> dict[str, float]:
+    """Compare both parts of an animation with those of a simulation of the same motion: the last three of `MEASURES`.
+
+        D = x(alpha = 1) - x(alpha = 0),  R = x_dynamic - x_static:   correlation D . R / (|D| |R|),  factor D . R / |D|^2
+
+    Args:
+        moving, still: (frames, verts, 3) in m of alpha = 1 and of alpha = 0. reference, static_reference: simulated with
+            inertia and without, where every frame is the equilibrium in its pose.
+
+    The sums are over all vertices and frames. A factor or correlation is NaN where a part is zero.
+    """
+    moving, still, reference, static_reference = (
+        np.asarray(x, np.float64) for x in (moving, still, reference, static_reference)
+    )
+    ours, theirs = moving - still, reference - static_reference
+    together, size, true_size = (float(np.sum(a * b)) for a, b in ((ours, theirs), (ours, ours), (theirs, theirs)))
+    both = np.sqrt(size * true_size)
+    return {
+        "static_distance": 1000 * float(np.linalg.norm(still - static_reference, axis=-1).mean()),
+        "dynamic_correlation": together / both if both > 0 else float("nan"),
+        "dynamic_factor": together / size if size > 0 else float("nan"),
+    }

@@ -16,7 +16,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import angles
-from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.pairs import Groups, groups_from
 from ncs_jax.energies.contact.surface import Surface, surface_from
@@ -28,14 +27,14 @@ from ncs_jax.energies.terms import Terms
 from ncs_jax.energies.total import distances
 from ncs_jax.errors import InputError, required, shaped
 from ncs_jax.geometry.mesh import Mesh, corners, edge_strain, with_middles
-from ncs_jax.geometry.numerics import angle_between, arctan2
+from ncs_jax.geometry.numerics import angle_between
 from ncs_jax.geometry.skinning import blend, unpose
-from ncs_jax.geometry.soa_vectors import cross, dot, length
+from ncs_jax.metrics.penetration import depths_in, depths_on_host
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.scene.step_inputs import Past, step_inputs
 
-__all__ = ["QUANTITIES", "measure", "summarise"]
+__all__ = ["QUANTITIES", "measure", "measure_on_host", "summarise"]
 
 # name: unit and what it is
 QUANTITIES = {
@@ -49,34 +48,6 @@ QUANTITIES = {
     "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
-
-DEEPEST = 128  # points of a frame that are asked a second time whether they are inside
-
-
-def winding_number(x: Float[Array, "points 3"], triangles: Float[Array, "faces 3 3"]) -> Float[Array, "points"]:
-    """Return how many times a surface encloses each point: 1 within a closed one, 0 outside; where it is open, by how much.
-
-    The sum of the triangles' solid angles, w = sum_f 2 atan2(a . (b x c), |a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|) /
-    (4 pi), with a, b, c from the point to the corners. Sources: van Oosterom and Strackee 1983; Jacobson et al. 2013.
-    """
-    a, b, c = ([triangles[None, :, k, i] - x[:, None, i] for i in range(3)] for k in range(3))
-    la, lb, lc = map(length, (a, b, c))
-    below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-    return jnp.sum(arctan2(dot(a, cross(b, c)), below), axis=-1) / (2 * np.pi)
-
-
-def _depth(x, body, surface: Surface, layered: bool) -> Float[Array, "points"]:
-    """Return how deep points are inside, m, by exact point-triangle distance.
-
-    With garments worn below (`layered`) a crease may be folded by a little more than 180 degrees, and the pseudo-normal there
-    points inward. The deepest points are therefore asked a second time: only what it also encloses is inside.
-    """
-    depth = -nearest_distance(x, body, surface)
-    if not layered:
-        return depth
-    deepest, at = lax.top_k(depth, min(DEEPEST, len(depth)))
-    inside = winding_number(x[at], body[surface.faces]) > 0.5
-    return depth.at[at].set(jnp.where(inside, deepest, -jnp.abs(deepest)))
 
 
 class _Frames(NamedTuple):
@@ -143,7 +114,7 @@ def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict
         if surface is None:
             depth = -distances(x, body, required(model.surface, "model.surface"), model.terms)
         else:
-            depth = _depth(with_middles(x, model.garment.mesh.edges), body, surface, bool(model.under))
+            depth = depths_in(with_middles(x, model.garment.mesh.edges), body, surface, bool(model.under))
         parts = {"depth_max": depth[:verts]}
         if surface is not None:
             parts["middle_depth_max"] = depth[verts:]
@@ -233,6 +204,32 @@ def measure(
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # a block keeps only one core busy
         blocks += pool.map(measured, others)
     return {name: np.concatenate([rows[name] for rows in blocks])[:count] for name in blocks[0]}
+
+
+def measure_on_host(
+    model: Model, vertices: np.ndarray, skin: np.ndarray | None = None, *, middles: bool = True
+) -> dict[str, np.ndarray]:
+    """Return `strain_mean`, and with a body what `QUANTITIES` says of penetration, of each frame: `measure` compiling nothing.
+
+    Args:
+        vertices: (frames, verts, 3), m, such as a few frames of a motion. skin: what the garment may touch, as
+            `model.surface` numbers it, in these frames (frames, body, 3), m. middles: also look at the middles of the edges.
+    """
+    mesh = model.garment.mesh
+    edges, rest = np.asarray(mesh.edges), np.asarray(mesh.edge_length, np.float64)
+    x = np.asarray(vertices, np.float64)
+    lengths = np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2)
+    rows = {"strain_mean": 100 * np.abs(lengths / np.where(rest > 0, rest, 1) - 1).mean(axis=1)}
+    if skin is None or model.surface is None:
+        return rows
+    points = np.stack([with_middles(frame, edges) for frame in x]) if middles else x
+    depths = depths_on_host(points, skin, np.asarray(model.surface.faces), layered=bool(model.under))
+    own = x.shape[1]
+    rows["penetrating"] = 100 * (depths[:, :own] > 0).mean(axis=1)
+    for name, part in (("depth_max", depths[:, :own]), ("middle_depth_max", depths[:, own:])):
+        if part.size:
+            rows[name] = 1000 * np.maximum(part.max(axis=1), 0)
+    return rows
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:

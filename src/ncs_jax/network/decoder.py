@@ -92,7 +92,7 @@ class Decoder(nn.Module):
         offsets = self.local * self.offsets(h)
         if self.modes:
             coefficients = self.coefficients(h).reshape(self.modes, -1)
-            offsets = offsets + jnp.matmul(basis, coefficients).reshape(offsets.shape)
+            offsets = offsets + jnp.matmul(basis, coefficients, precision="highest").reshape(offsets.shape)
         return offsets.reshape(self.verts, 3, *code.shape[:-1])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +15,7 @@ from jaxtyping import Array, Float
 from ncs_jax import io
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
-from ncs_jax.network.methods.method import Method, initial_parameters
-from ncs_jax.network.methods.swing import Swing
+from ncs_jax.network.methods.method import Method
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
@@ -59,6 +59,7 @@ def build(
     below: Sequence[Below] = (),
     dtype=jnp.float32,
     report: Callable[[str], None] | None = None,
+    ahead: Callable[[Assembly], None] | None = None,
 ) -> Assembly:
     """Read every file of a scene, check that they fit together, and precompute all that does not change.
 
@@ -67,6 +68,7 @@ def build(
         below: the trained garments of `garment.over`, each with the body that it was trained on.
         dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words; without
             one, what takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
+        ahead: called before vibrations are looked for, with what is expected: zeros in their place.
 
     Raises:
         InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
@@ -83,7 +85,13 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
-            prepared = _with_vibrations(scene, prepared, model, faces, known, report or _tell_a_person)
+
+            def begin() -> None:
+                (report or _tell_a_person)("finding the garment's vibrations, which may take a minute")
+                if ahead is not None:
+                    ahead(_expected(setting, model, known))
+
+            prepared = _with_vibrations(scene, prepared, model, faces, known, begin)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network_from(scene, model), track)
@@ -114,24 +122,33 @@ def _tell_a_person(words: str) -> None:
         sys.stderr.write(f"ncs_jax: {words} ...\n")
 
 
-def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures, say) -> Prepared:
+def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, track: MotionFeatures, begin) -> Prepared:
     """Add the garment's vibrations, if any, found with smooth contact, because a simulation converges with no other."""
     from ncs_jax.simulation.ritz_modes import softest_ritz_modes
 
+    smooth, count = model, scene.network.vibrations
     if faces is not None:
-        model = replace(model, terms=replace(model.terms, collision="smooth"), surface=surface_of(model, faces, track, True))
-    count = scene.network.vibrations
+        smooth = replace(model, terms=replace(model.terms, collision="smooth"), surface=surface_of(model, faces, track, True))
 
     def found() -> dict[str, np.ndarray] | None:
-        say("finding the garment's vibrations, which may take a minute")
-        modes = softest_ritz_modes(model, track, count)
+        begin()
+        modes = softest_ritz_modes(smooth, track, count)
         if modes is None:
             return None
         slope = _range(scene, replace(model, vibrations=modes), track)
         arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope}
         return {name: np.asarray(array) for name, array in arrays.items()}
 
-    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, model, track, str(scene.network)) or {}))
+    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, smooth, track, str(scene.network)) or {}))
+
+
+def _expected(setting: Setting, model: Model, track: MotionFeatures) -> Assembly:
+    """Return what a scene becomes whose garment has all the vibrations that it may have: of zeros, as they are not known."""
+    scene, basis = setting.scene, model.basis
+    count, zeros = scene.network.vibrations, functools.partial(np.zeros, dtype=basis.dtype)
+    modes = RitzModes(*map(jax.device_put, (zeros((len(basis), 3, count)), zeros(()), zeros((count, count)))))
+    setting = replace(setting, model=replace(model, vibrations=modes))
+    return Assembly(**vars(setting), network=network_from(scene, setting.model), training_features=track)
 
 
 def _range(scene: Scene, model: Model, track: MotionFeatures) -> np.ndarray:
@@ -142,9 +159,11 @@ def _range(scene: Scene, model: Model, track: MotionFeatures) -> np.ndarray:
     q are the training's swings of the garment that a fresh network gives, next to that of skinning. One that is b times as
     far as any of them has q^T W q = 1, by how far they go in its own direction.
     """
+    from ncs_jax.training.step import initial_state, refreshed
+
     network, vibrations = network_from(scene, model), required(model.vibrations, "vibrations")
-    params = initial_parameters(network, jax.random.PRNGKey(0), model)
-    q = np.asarray(jax.jit(Swing.swings, static_argnums=0)(network, params, model, track), np.float64)
+    params = initial_state(model, network, 0).params  # by the programs that training begins with
+    q = np.asarray(refreshed(network, params, model, track)["swing"], np.float64)
     spread, slope = q.T @ q / len(q), np.asarray(vibrations.slope, np.float64)
     if not spread.any():
         return slope

@@ -130,7 +130,7 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
             found = from_frame(read(number, number + 1), of, up, 0, said)
         except InputError as error:
             raise InputError(error.expected, field="motion.rest", value=spec.rest, mend="write a frame of the file") from None
-    return replace(since(motion, found), up=up, notes=(*motion.notes, found.note))
+    return replace(since(motion, found), up=up, notes=(*motion.notes, found.note), uncertain=found.uncertain)
 
 
 def lead_in_frames(motion: MotionRecord) -> int:

@@ -148,7 +148,7 @@ def retarget(
     notes = [*_notes(result, motion.joint_names, source.shaped, legs, scaled_by, float(soles.max() - low))]
     if absent := [n for n in joints if n not in motion.joint_names]:
         notes.append(f"motion.joints names joints that this motion does not have: {', '.join(absent)}")
-    return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright))))
+    return replace(result, motion=replace(result.motion, notes=(*notes, *turn_note(upright)), uncertain=motion.uncertain))
 
 
 def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) -> tuple[Limbs, Limbs, dict[int, int]]:

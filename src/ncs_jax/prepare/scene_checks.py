@@ -6,7 +6,7 @@ and nothing fails; outside them a scene is at risk. What cannot work at all is r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +14,8 @@ import numpy as np
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights
-from ncs_jax.geometry.surface_distance import border_of, signed_distance
 from ncs_jax.io import MotionRecord
+from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
@@ -42,7 +42,6 @@ DEEP = 0.01  # m that vertices may be inside the body, where the body alone carr
 MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
-CLEAR = 0.005  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
 @dataclass(frozen=True)
@@ -117,17 +116,16 @@ def _grain(a: Setting) -> Iterator[Risk]:
 
 
 def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m, or -`CLEAR` if clear of it."""
+    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m."""
     model, body = a.model, required(a.body, "body")
     rest, skin = (np.asarray(x, np.float64) for x in (model.garment.mesh.rest, required(model.body, "model.body")))
-    border = border_of(faces, int(faces.max()) + 1)
-    depths = []
+    cloths, bodies = [], []
     for pose, transforms in zip(poses, joint_transforms(body, poses)[:, list(model.source_joints)], strict=True):
         bare = corrected_rest(skin, model.correctives, transforms, model.skeleton.parents)
         surface = [carried(bare, required(model.body_blend, "model.body_blend"), transforms), *_worn_below(model, pose)]
-        x = carried(rest, model.blend, transforms)
-        depths.append(-signed_distance(x, np.concatenate(surface), faces, border, CLEAR))
-    return np.stack(depths)
+        cloths.append(carried(rest, model.blend, transforms))
+        bodies.append(np.concatenate(surface))
+    return depths_on_host(np.stack(cloths), np.stack(bodies), faces, layered=bool(model.under))
 
 
 def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
@@ -190,6 +188,19 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
         yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
 
 
+def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
+    """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most."""
+    built = {name: record.uncertain for name, record in motions.items() if record.uncertain}
+    if built:
+        parts = dict.fromkeys(part for one in built.values() for part in one)
+        worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)
+        mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
+        risk = "they lean, or look up or down, by so much in all frames"
+        yield Risk(
+            "the pose at rest had to be built", f"right to about so many degrees: {worst}, in {', '.join(built)}", risk, mend
+        )
+
+
 def _postures(a: Setting) -> Iterator[Risk]:
     """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
     world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
@@ -201,6 +212,7 @@ def _postures(a: Setting) -> Iterator[Risk]:
 def motion_risks(a: Setting) -> list[Risk]:
     """Return what puts a scene at risk in its motions themselves, whatever is worn."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found += _uncertain(a.motions)
     found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
     return [*found, *_postures(a)]
 

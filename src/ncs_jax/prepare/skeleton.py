@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,16 +16,19 @@ from ncs_jax.prepare.posing import joint_places, world_axes, world_turns
 
 __all__ = [
     "LIMBS",
+    "angle",
     "body_axes",
     "bone",
     "forward",
     "joint_turns",
     "least_turn",
+    "person_axes",
     "rest_of",
     "sampled",
     "side_vector",
     "standing_axis",
     "top",
+    "trunk_of",
     "up_axis",
 ]
 
@@ -128,3 +132,22 @@ def bone(of: Limbs, end: str, joints: np.ndarray, tips: np.ndarray | None, j: in
     place = joints[of.roles[end]] if of.roles.get(end, j) != j else joints[j] if tips is None else tips[j]
     vector = (place - joints[j]).astype(np.float64)
     return vector if np.linalg.norm(vector) > 0 else None
+
+
+def trunk_of(of: Limbs) -> list[int]:
+    """Return the joints from the hips to the head."""
+    return [of.roles["hips"], *of.spine, *of.neck, *([of.roles["head"]] if "head" in of.roles else [])]
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> Any:
+    """Return the angle in degrees between vectors (..., 3)."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+
+
+def person_axes(places: np.ndarray, of: Limbs, up: str) -> np.ndarray:
+    """Return columns (..., 3, 3) that point left, up and ahead of a person who stands: the heading, and the world's up."""
+    vertical = np.eye(3)["xyz".index(up)]
+    left = side_vector(places, of)
+    left = left - (left @ vertical)[..., None] * vertical
+    left = left / np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-30)
+    return np.stack([left, np.broadcast_to(vertical, left.shape), np.cross(left, vertical)], axis=-1)

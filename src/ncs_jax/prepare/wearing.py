@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 
@@ -75,7 +76,8 @@ def skin_of(body: BodyRecord) -> Skin:
     """Return a body as a garment meets it."""
     from scipy.spatial import cKDTree
 
-    points, normals, area = _even(body.vertices, body.faces, POINTS)
+    points, normals, _ = _even(body.vertices, body.faces, POINTS)
+    triangles = body.vertices[body.faces].astype(np.float64)
     tree, tall = cKDTree(points), float(np.ptp(body.vertices, axis=0).max())
     pieces, joints = [np.zeros((0, 2, 3))], [np.zeros(0, int)]
     for joint, start, end in _bones(body):
@@ -83,7 +85,8 @@ def skin_of(body: BodyRecord) -> Skin:
         along = start + np.linspace(0, 1, max(count, 2))[:, None] * (end - start) + OFF
         nearest = tree.query(along)[1]
         within = np.sum((along - points[nearest]) * normals[nearest], axis=1) < 0
-        within |= _enclosed(along, points, normals, area)  # where thighs touch, the nearest skin is the other one's
+        other = np.flatnonzero(~within)  # where thighs touch, the nearest skin is the other one's
+        within[other] = winding_number(along[other], triangles) > 0.5
         kept = within[1:] & within[:-1]
         pieces.append(np.stack([along[:-1], along[1:]], axis=1)[kept])
         joints.append(np.full(int(kept.sum()), joint))
@@ -95,17 +98,6 @@ def skin_of(body: BodyRecord) -> Skin:
     shape = [int(n) for n in np.ceil((high - low) / cell) + 8]
     middles = corner + cell * (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5)
     return Skin(tree, points, normals, bones, np.concatenate(joints), places, tall, corner, tree.query(middles)[1])
-
-
-def _enclosed(x: np.ndarray, points: np.ndarray, normals: np.ndarray, area: float) -> np.ndarray:
-    """Return which of x (N, 3) a surface encloses, by points (P, 3) evenly on it: w = A / (4 pi P) sum_p n . r / |r|^3 > 1/2.
-
-    Source: the winding number of oriented points, Barill et al. 2018.
-    """
-    gap = points - x[:, None]
-    square = np.einsum("npi,npi->np", gap, gap)
-    turns = np.einsum("npi,pi->np", gap, normals) / np.maximum(square, area / len(points)) ** 1.5
-    return turns.sum(axis=1) * area / (4 * np.pi * len(points)) > 0.5
 
 
 def _thinned(points: np.ndarray, least: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +19,7 @@ from ncs_jax.prepare.build import Assembly
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
-from ncs_jax.runs.run import NetworkMaker, Run, assemble, check_own, load_run
+from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
 from ncs_jax.scene.model import RitzModes
 from ncs_jax.scene.spec import NetworkSpec, Scene, scene_from
 from ncs_jax.training.step import initial_state
@@ -33,25 +34,21 @@ def assemble_run(
     facts: dict | None,
     out: Path | None,
     start: Run | str | Path | None,
-    *,
-    terms: Sequence[OwnTerm],
     network: NetworkMaker | None,
-    report: Callable[[str], None] | None = None,
+    make_ready: Callable[..., Assembly],
 ) -> tuple[Assembly, dict | None]:
     """Make the scene of a run ready; return it, and the weights that it begins with where it begins with another run's.
 
     Args:
         scene: the run's. facts: of the run that is resumed, if any, in the folder `out`. start: a run to begin from, if any.
-        report: called with what is done next, see `run.assemble`.
+        network: one's own, if any. make_ready: `run.assemble` but for the scene.
 
     Raises:
         InputError: a file is unusable, or terms, network or the run to begin from do not fit.
     """
     if start is not None:
-        return _assemble_started(start, scene, terms, network, report)
-    if facts is not None and out is not None:
-        check_own(facts, out, terms, network)
-    assembly = assemble(scene, terms=terms, network=network, report=report)
+        return _assemble_started(start, scene, network, functools.partial(make_ready, ahead=None))
+    assembly = make_ready(scene)
     if facts is not None and out is not None and facts.get("start"):  # of the run it began from: not found anew
         assembly = _with_fields_of(read_prepared(out), assembly)
     return assembly, None
@@ -60,11 +57,12 @@ def assemble_run(
 # --- where a run stopped ----------------------------------------------------------------------------------------------------
 
 
-def facts_of_run(out: Path | None, resume: bool) -> dict | None:
+def facts_of_run(out: Path | None, resume: bool, terms: Sequence[OwnTerm], network: NetworkMaker | None) -> dict | None:
     """Return what run.json says of the run to resume, None for a new run.
 
     Raises:
-        InputError: there is no run to resume, there is one that is not to be resumed, or the folder cannot be written.
+        InputError: there is no run to resume, there is one that is not to be resumed or has other terms or another network of
+            its own, or the folder cannot be written.
     """
     if out is not None:
         check_writable(out)
@@ -74,7 +72,9 @@ def facts_of_run(out: Path | None, resume: bool) -> dict | None:
         return None
     if not resume:
         raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
-    return read_run(out)
+    facts = read_run(out)
+    check_own(facts, out, terms, network)
+    return facts
 
 
 def _check_swing(kept: Prepared, run: str) -> None:
@@ -127,9 +127,8 @@ def _differences(kept: dict, given: dict, where: str = "") -> Iterator[str]:
 def _assemble_started(
     start: Run | str | Path,
     scene: Scene,
-    terms: Sequence[OwnTerm],
     network: NetworkMaker | None,
-    report: Callable[[str], None] | None,
+    make_ready: Callable[..., Assembly],
 ) -> tuple[Assembly, dict]:
     """Make a scene ready for a network that another run has trained; return it and the weights.
 
@@ -149,7 +148,7 @@ def _assemble_started(
         _check_network(name, before.scene.network, scene)
     if not scene.body.joints:
         scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
-    assembly = assemble(scene, terms=terms, network=network, report=report)
+    assembly = make_ready(scene)
     if not np.array_equal(before.garment.faces, assembly.garment.faces):
         size = f"{len(assembly.garment.vertices)} vertices, {len(assembly.garment.faces)} triangles"
         expected = f"the triangles of the garment of {name} expected, {len(before.garment.faces)}"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
+from jax.stages import Compiled
+from jax.tree_util import PyTreeDef
 from jaxtyping import Array
 
 from ncs_jax.energies.contact.surface import rebuild_lists
@@ -17,12 +20,13 @@ from ncs_jax.prepare.build import Assembly
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.training.batches import batches
-from ncs_jax.training.devices import batch_mesh, compiled, local, replicate, shard_batch
+from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
-from ncs_jax.training.step import TrainState, chunk_runner, initial_state
+from ncs_jax.training.programs import Programs
+from ncs_jax.training.step import TrainState, chunk_runner, initial_state, refreshed
 
-__all__ = ["PlacedScene"]
+__all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
@@ -34,13 +38,14 @@ class PlacedScene:
     `model` and `features` are this process's own copies. They hold the same numbers as those on the devices.
     """
 
-    def __init__(self, assembly: Assembly, seed: int):
-        spec, network = assembly.scene.training, assembly.network
+    def __init__(self, assembly: Assembly, seed: int, programs: Programs | None = None):
+        """`programs`: where some were begun already, see `begin_programs`."""
+        spec = assembly.scene.training
         self.assembly, self.seed = assembly, seed
         self.model, self.features = assembly.model, assembly.track
         self.mesh = batch_mesh(spec.batch)
-        self._chunk = chunk_runner(network, spec, self.mesh)
-        self._compiled: dict[int, Callable] = {}
+        self._programs, self._chunk, self._metrics = programs or Programs(), *_functions(assembly, self.mesh)
+        self._compiled: dict[int, Compiled] = {}
         self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
 
     @property
@@ -72,13 +77,13 @@ class PlacedScene:
     def run_chunk(self, state: TrainState, first: int, count: int, steps: int) -> tuple[TrainState, dict[str, Array]]:
         """Take the steps first to first + count of `steps`; the state given is used up. Return the new one and the logs."""
         arguments = self._arguments(state, first, count, steps)
-        return self._ready(arguments)(*arguments)
+        return self._ready(arguments)(*jax.tree.leaves(arguments))
 
     def measure(self, params: dict, done: int) -> dict[str, float]:
         """Return `training_metrics` of a few frames of the last of the `done` steps."""
-        ends = self._ends(done - 1, 1)[0, :SEEN]
-        network, window = self.assembly.network, self.assembly.scene.training.window
-        return {k: float(v) for k, v in _metrics(self.model, network, window, params, self.features, ends).items()}
+        arguments = self.model, params, self.features, self._ends(done - 1, 1)[0, :SEEN]
+        program = self._programs.ready("metrics", self._metrics, *arguments)
+        return {k: float(v) for k, v in program(*jax.tree.leaves(arguments)).items()}
 
     def diagnose(self, state: TrainState) -> str:
         """Return why the last dropped step was dropped."""
@@ -87,7 +92,7 @@ class PlacedScene:
     def refresh(self, params: dict) -> None:
         """Recompute what the network adds to the motions, such as the swing: see `Method.refresh`."""
         if self.assembly.network.refreshes:
-            told = _told(self.assembly.network, params, self.model, self.assembly.track)
+            told = refreshed(self.assembly.network, params, self.model, self.assembly.track)
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
@@ -114,25 +119,50 @@ class PlacedScene:
         pairs = np.stack([rng.permutation(ends.shape[1]) for rng in each]).astype(np.int32)
         return (state, *shard_batch(self.mesh, (ends, pairs)), steps, *self._everywhere)
 
-    def _ready(self, arguments: tuple) -> Callable:
+    def _ready(self, arguments: tuple) -> Compiled:
         """Return the program for a chunk's arguments, compiled once for every number of steps."""
-        count = len(arguments[1])
+        count, batch = arguments[1].shape
         if count not in self._compiled:
-            self._compiled[count] = compiled(self._chunk, *arguments)
+            self._compiled[count] = self._programs.ready("chunk", self._chunk, *arguments, reused=True)
+            check_fits(self._compiled[count], batch)
         return self._compiled[count]
 
 
-_metrics = jax.jit(training_metrics, static_argnums=(1, 2))
+def begin_programs(programs: Programs, assembly: Assembly, count: int) -> None:
+    """Begin to compile what trains a scene `count` steps and what measures it then, where a single device does it.
+
+    Of the arrays of the assembly no more than their shapes counts.
+    """
+    network, batch = assembly.network, assembly.scene.training.batch
+    structures: list[PyTreeDef] = []
+    if batch_mesh(batch) is not None:
+        return
+
+    def shapes(model: Model, track: MotionFeatures) -> list[list[Array]]:
+        state, placed, ends = (
+            initial_state(model, network, 0),
+            with_bodies(model, track, batch),
+            np.zeros((count, batch), np.int32),
+        )
+        told = refreshed(network, state.params, model, track) if network.refreshes else {}
+        chunk = state, ends, ends, count, model, replace(placed, **told)
+        metrics = model, state.params, replace(track, **told), ends[0, :SEEN]
+        structures.extend(map(jax.tree.structure, (chunk, metrics)))
+        return [jax.tree.leaves(chunk), jax.tree.leaves(metrics)]
+
+    chunk, metrics = jax.eval_shape(shapes, assembly.model, assembly.track)
+    steps, measures = _functions(assembly, None)
+    programs.begin("chunk", steps, chunk, structures[0], reused=True)
+    programs.begin("metrics", measures, metrics, structures[1])
+
+
+def _functions(assembly: Assembly, mesh: Mesh | None) -> tuple[Callable, Callable]:
+    """Return what is compiled: a chunk of steps, and `training_metrics` of model, parameters, motions and frames."""
+    network, spec = assembly.network, assembly.scene.training
+    return chunk_runner(network, spec, mesh), lambda model, *given: training_metrics(model, network, spec.window, *given)
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _garment_and_body(model: Model, network: Method, params: dict, motions: MotionFeatures) -> tuple[Array, Array]:
     """Return the vertices of the garment, static, and of the body in every frame."""
     return animate(model, network, params, motions, None), jax.vmap(lambda at: pose_body(model, at))(motions.matrices)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _told(network: Method, params: dict, model: Model, motions: MotionFeatures) -> dict[str, Array]:
-    """Return the fields that `refresh` changes, and no others: a compiled program would copy them."""
-    new = network.refresh(params, model, motions)
-    return {f.name: getattr(new, f.name) for f in fields(new) if getattr(new, f.name) is not getattr(motions, f.name)}

@@ -202,6 +202,7 @@ def assemble(
     network: NetworkMaker | None = None,
     dtype=jnp.float32,
     report: Callable[[str], None] | None = None,
+    ahead: Callable[[Assembly], None] | None = None,
 ) -> Assembly:
     """Make a scene ready: read its files and the runs of the garments worn below, check that they fit, precompute the rest.
 
@@ -210,7 +211,8 @@ def assemble(
         terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: makes a network of one's own from scene
             and model, see `network.methods.method.Method`; else the scene's.
         dtype: of everything; float64 needs JAX's x64 mode. report: called with what is done next, in words; without one, what
-            takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
+            takes long is told on stderr in a terminal or a notebook, and nothing elsewhere. ahead: called before that with
+            what is expected, zeros in the place of the vibrations, so that programs can be compiled meanwhile.
 
     What takes long are the vibrations of `network.cell = "swing"`. Energies need none: with "gated" none are looked for.
 
@@ -219,10 +221,17 @@ def assemble(
     """
     if network is not None and scene.network.cell == "auto":  # one's own needs no vibrations, unless the scene asks for them
         scene = replace(scene, network=replace(scene.network, cell="gated"))
-    assembly = build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report)
-    if terms:
-        assembly = replace(assembly, model=assembly.model.with_terms(terms))
-    return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
+
+    def with_own(assembly: Assembly) -> Assembly:
+        if terms:
+            assembly = replace(assembly, model=assembly.model.with_terms(terms))
+        return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
+
+    def expected(assembly: Assembly) -> None:
+        if ahead is not None and network is None:  # one's own may look at the vibrations
+            ahead(with_own(assembly))
+
+    return with_own(build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report, ahead=expected))
 
 
 def worn_below(scene: Scene) -> list[Below]:

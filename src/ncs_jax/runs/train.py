@@ -22,12 +22,13 @@ from ncs_jax.metrics.quality import summarise
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
-from ncs_jax.runs.placed_scene import PlacedScene
+from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
 from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
-from ncs_jax.runs.run import NetworkMaker, Run, load_run, own_names
+from ncs_jax.runs.run import NetworkMaker, Run, assemble, load_run, own_names
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.training.batches import CHUNK, chunks
 from ncs_jax.training.devices import trim_memory
+from ncs_jax.training.programs import Programs
 from ncs_jax.training.step import TrainState
 
 __all__ = ["train"]
@@ -53,45 +54,42 @@ def train(
     """Train a garment from the physics energy alone, on every device that JAX sees.
 
     Args:
-        scene: a scene, or the path of a scene file.
-        out: run folder for checkpoints and logs; None keeps nothing.
-        steps: optimiser steps in all, else the scene's.
-        minutes: instead, as many steps as fit, from the first step on; fewer than 300 in all are warned of.
-        seed: else the scene's.
-        resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned. Its scene and seed stand. The
-            learning rate is that of a run of so many steps from its beginning.
+        scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
+        steps: optimiser steps in all, else the scene's. minutes: instead, as many as fit, from the first step on. seed: alike.
+        resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned; its scene and seed stand.
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
         report: called after every chunk of steps; KeyboardInterrupt from it ends the run with a checkpoint of these steps.
-        say: called before the first step with what is done next, in words.
-        terms: of one's own, see `energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step inputs, in
-            J.
-        network: makes a network of one's own from scene and model, see `network.methods.method.Method`.
+        say: called with what is done next, in words, before the first step. terms: of one's own, see `energies.terms.OwnTerm`.
+        network: makes one's own from scene and model, see `network.methods.method.Method`.
 
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 
     Raises:
-        InputError: the scene or the folder is unusable, a run has more steps than it is to have, `start` does not fit, or the
-            hosts do not divide the batch.
+        InputError: scene or folder are unusable, a run has more steps than it is to have, or `start` or the hosts do not fit.
     """
     scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
     out = None if out is None else Path(out)
     _check_options(steps, minutes, resume, start)
-    facts = facts_of_run(out, resume)
+    facts = facts_of_run(out, resume, terms, network)
     if out is not None and facts is not None:
         scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
         if minutes is None and Checkpoints(out).latest() == (steps or facts["steps"]):  # nothing is left to train
             return load_run(out, terms=terms, network=network)
-    assembly, params = assemble_run(scene, facts, out, start, terms=terms, network=network, report=say)
+    programs, first = Programs(), CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps)
+    begin = functools.partial(begin_programs, programs, count=first)  # while the rest is found out
+    make_ready = functools.partial(assemble, terms=terms, network=network, report=say, ahead=begin)
+    assembly, params = assemble_run(scene, facts, out, start, network, make_ready)
     trim_memory()
     if say is not None:
         say("compiling")
-    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed)
+    begin(assembly)
+    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed, programs)
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
     state = placed.initial_state(params)
     placed.refresh(state.params)
     if facts is None:  # before anything is written: whether it fits into memory
-        placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps))
+        placed.compile(state, first)
         facts = {"steps": 0, **own_names(terms, network)} | ({"start": str(start)} if start else {})
     with closing(_Output(placed, out, report, facts)) as output:
         if params is not None:

@@ -59,7 +59,7 @@ def _evaluated(problem: Problem, x, held, at):
     problem = with_neighbours(problem, find_neighbours(problem, x))
     point = evaluate(problem, x)
     diagonal, off = stiffness_blocks(problem, x, point)
-    force = jnp.einsum("vij,vj->vi", held, x - at)
+    force = jnp.einsum("vij,vj->vi", held, x - at, precision="highest")
     point = point._replace(value=point.value + jnp.sum(force * (x - at)) / 2, gradient=point.gradient + force)
     return problem, point, (diagonal + held, off)
 

@@ -13,10 +13,11 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
+from jax.stages import Compiled
 
 from ncs_jax.errors import InputError
 
-__all__ = ["batch_mesh", "compiled", "free_memory", "local", "replicate", "shard_batch", "trim_memory"]
+__all__ = ["batch_mesh", "check_fits", "free_memory", "local", "replicate", "shard_batch", "trim_memory"]
 
 
 def batch_mesh(batch: int) -> Mesh | None:
@@ -78,24 +79,19 @@ def free_memory() -> int | None:
     return min(known, default=None)
 
 
-def compiled(program, *arguments):
-    """Compile a training program for its arguments, the first of which it may reuse, if it fits into memory.
+def check_fits(program: Compiled, batch: int) -> None:
+    """Check that a compiled training program of so many windows a step fits into memory.
 
     Raises:
         InputError: what it needs beside its arguments is more than is free.
     """
-    leaves, structure = jax.tree.flatten(arguments)
-    reused = range(len(jax.tree.leaves(arguments[0])))
-    flat = jax.jit(lambda *leaves: program(*structure.unflatten(leaves)), donate_argnums=reused)
-    ready = flat.lower(*leaves).compile()
-    size, free = ready.memory_analysis(), free_memory()
+    size, free = program.memory_analysis(), free_memory()
     needed = 0 if size is None else size.temp_size_in_bytes + size.output_size_in_bytes - size.alias_size_in_bytes
     if free is not None and needed > free:
         raise InputError(
-            "training does not fit into memory", field="training.batch", value=arguments[1].shape[1],
+            "training does not fit into memory", field="training.batch", value=batch,
             mend=f"it needs {needed / 1e9:.3g} GB where {free / 1e9:.3g} GB are free: lower it, or use a coarser garment",
         )  # fmt: skip
-    return lambda *arguments: ready(*jax.tree.leaves(arguments))
 
 
 def trim_memory() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import jax
@@ -20,7 +20,7 @@ from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import TrainingSpec
 from ncs_jax.training.loss import gradients
 
-__all__ = ["Fault", "Task", "TrainState", "chunk_runner", "initial_state", "step_size", "windows_of"]
+__all__ = ["Fault", "Task", "TrainState", "chunk_runner", "initial_state", "refreshed", "step_size", "windows_of"]
 
 
 @jax.tree_util.register_dataclass
@@ -62,6 +62,13 @@ def initial_state(model: Model, network: Method, seed: int) -> TrainState:
     zero = jnp.zeros((), jnp.int32)
     fault = Fault(zero, zero, jnp.zeros((3, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype))
     return TrainState(params, ADAM.init(params), zero, zero, fault)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def refreshed(network: Method, params: dict, model: Model, motions: MotionFeatures) -> dict[str, Array]:
+    """Return the fields that `Method.refresh` changes, and no others: a compiled program would copy them."""
+    new = network.refresh(params, model, motions)
+    return {f.name: getattr(new, f.name) for f in fields(new) if getattr(new, f.name) is not getattr(motions, f.name)}
 
 
 def _sample(share, index, axis: str | None):

@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.surface_distance import border_of, signed_distance
-from ncs_jax.metrics.quality import DEEPEST, winding_number
+from ncs_jax.metrics.quality import measure_on_host, summarise
 from ncs_jax.runs.run import Run
 from ncs_jax.view import curves, page, pictures
 from ncs_jax.view.animation import Animation
@@ -26,7 +24,6 @@ ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
 MEASURED = 24  # frames, at most, of which strain and penetration are measured
-CLEAR = 0.02  # m; cloth that is farther outside the nearest vertex's tangent plane is not inside the body
 
 
 @dataclass(frozen=True)
@@ -51,8 +48,8 @@ def preview(
 
     The picture and the page come first, the measures last, and the page is then written again with them. Strain and penetration
     are exact, of every n-th frame, so that there are no more than `MEASURED`: `ncs evaluate` measures all, and the energies.
-    Keys: strain_mean (%), and with a body penetrating (%) and depth_max (mm), as in `metrics.quality.QUANTITIES`; every, which
-    is n. The curves need a log and matplotlib, of the `plots` extra.
+    Keys: strain_mean (%), with a body penetrating (%), depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n;
+    measured, frames. Where skin is outside the cloth: bare, in how many; barest, the worst. Curves need a log and matplotlib.
 
     Args:
         run: trained.
@@ -108,27 +105,18 @@ def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
 
 
 def _measured(run: Run, animation: Animation) -> dict[str, float]:
-    """Return mean strain and penetration of every n-th frame, found on the host: nothing is compiled for them."""
-    model, every = run.assembly.model, -(-len(animation.garment) // MEASURED)
-    cloths = np.asarray(animation.garment[::every], np.float64)
-    mesh = model.garment.mesh
-    edges, rest = np.asarray(mesh.edges), np.asarray(mesh.edge_length, np.float64)
-    lengths = np.linalg.norm(cloths[:, edges[:, 1]] - cloths[:, edges[:, 0]], axis=2)
-    strain = np.abs(lengths / np.where(rest > 0, rest, 1) - 1)
-    found = {"strain_mean": 100 * float(strain.mean()), "every": float(every)}
-    if model.surface is None or animation.body is None:
-        return found
-    faces, part, whole = np.asarray(model.surface.faces), run.assembly.prepared.part, animation.body.vertices
-    count = whole.shape[1] - animation.body.worn
-    bodies = np.concatenate([whole[::every, part], whole[::every, count:]], axis=1).astype(np.float64)
-    border = border_of(faces, bodies.shape[1])
-    depths = np.stack([-signed_distance(x, y, faces, border, CLEAR) for x, y in zip(cloths, bodies, strict=True)])
-    if model.under:  # as `metrics.quality` does, because a crease of what is worn below may be folded
-        for depth, x, y in zip(depths, cloths, bodies, strict=True):
-            deepest = np.argsort(-depth)[:DEEPEST]
-            inside = np.asarray(winding_number(jnp.asarray(x[deepest]), jnp.asarray(y[faces]))) > 0.5
-            depth[deepest] = np.where(inside, depth[deepest], -np.abs(depth[deepest]))
-    return found | {"penetrating": 100 * float((depths > 0).mean()), "depth_max": 1000 * max(0.0, float(depths.max()))}
+    """Return mean strain and penetration of every n-th frame."""
+    every, skin = -(-len(animation.garment) // MEASURED), None
+    if animation.body is not None:
+        part, whole = run.assembly.prepared.part, animation.body.vertices
+        count = whole.shape[1] - animation.body.worn
+        skin = np.concatenate([whole[::every, part], whole[::every, count:]], axis=1)
+    rows = measure_on_host(run.assembly.model, animation.garment[::every], skin)
+    found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
+    if "depth_max" in rows:
+        out = np.maximum(rows["depth_max"], rows["middle_depth_max"])
+        found |= {"bare": float((out > 0).sum()), "barest": float(every * out.argmax())} if out.any() else {}
+    return found
 
 
 def _draw_curves(folder: Path, log: Path) -> Path | None:

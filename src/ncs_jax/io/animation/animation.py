@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.animation.glb import write_glb
+from ncs_jax.io.animation.glb import NAMES, write_glb
 from ncs_jax.io.animation.mdd import read_mdd, write_mdd
 from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
@@ -36,6 +36,7 @@ def write_animation(
     rest: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | None = None,
+    names: tuple[str, str] = NAMES,
 ) -> None:
     """Write a moving mesh in the format of the suffix; the file or folder appears whole or not at all.
 
@@ -48,7 +49,7 @@ def write_animation(
         path: the file to write; missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
         rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. uv: (F, 3, 2) texture coordinates of the
             triangles' corners, which .glb, USD and .obj hold and the other formats leave out. worn_by: the body and its motion
-            of T frames, to be written into a .glb too.
+            of T frames, to be written into a .glb too. names: of the mesh and the body there.
 
     Raises:
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
@@ -69,7 +70,7 @@ def write_animation(
     elif suffix == ".mdd":
         write_mdd(file, x, float(fps))
     elif suffix == ".glb":
-        write_glb(file, x, triangles, float(fps), uv=maps, worn_by=worn_by)
+        write_glb(file, x, triangles, float(fps), uv=maps, worn_by=worn_by, names=names)
     elif suffix in USD:
         given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
         write_usd(file, x, triangles, float(fps), given, maps)

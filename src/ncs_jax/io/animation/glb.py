@@ -17,7 +17,7 @@ from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 
-__all__ = ["write_glb", "write_glb_body"]
+__all__ = ["NAMES", "write_glb", "write_glb_body"]
 
 FLOAT, SHORT, INT = 5126, 5123, 5125  # glTF's codes for types of numbers
 VERTICES, INDICES = 34962, 34963  # glTF's codes for the use of a buffer view
@@ -25,6 +25,7 @@ SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LARGEST = 2**32 - 1  # bytes that the header can count
 DESCRIPTION = 1000  # bytes; the JSON of a frame or a joint takes less
 MOST = 8  # joints that move a vertex, as in the package's own skinning
+NAMES = "garment", "body"  # of the meshes, where no better ones are known
 CLOTH, SKIN = (0.32, 0.47, 0.65, 1.0), (0.78, 0.74, 0.7, 1.0)
 
 
@@ -36,6 +37,7 @@ def write_glb(
     *,
     uv: np.ndarray | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | None = None,
+    names: tuple[str, str] = NAMES,
 ) -> None:
     """Write a moving mesh that plays in any viewer of glTF; the file appears whole or not at all.
 
@@ -52,6 +54,7 @@ def write_glb(
     Args:
         path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
         uv: (F, 3, 2) texture coordinates of corners, v upward. worn_by: the body and its motion of T frames.
+            names: of the moving mesh and of the body, as a modeller lists them.
 
     Raises:
         InputError: the file would be larger than 4 GiB, which the format cannot count, or it cannot be written.
@@ -69,16 +72,16 @@ def write_glb(
         )  # fmt: skip
     document = _Document()
     keys = None if frames == 1 else document.array((np.arange(frames) / fps).astype("<f4")[:, None], bounded=True)
-    _garment(document, vertices, faces, split, keys)
+    _garment(document, names[0], vertices, faces, split, keys)
     if worn_by is not None:
-        _body(document, *worn_by, keys)
+        _body(document, names[1], *worn_by, keys)
     _write(path, document)
 
 
 def write_glb_body(path: str | Path, body: BodyRecord) -> None:
     """Write a body at rest, as a skinned mesh on its joints; the file appears whole or not at all."""
     document, still = _Document(), np.zeros((1, len(body.joints), 3))
-    _body(document, body, MotionRecord(still, still[:, 0], 1.0), None)
+    _body(document, NAMES[1], body, MotionRecord(still, still[:, 0], 1.0), None)
     _write(path, document)
 
 
@@ -190,7 +193,7 @@ def _split(count: int, faces: np.ndarray, uv: np.ndarray | None) -> _Split:
     return _Split(source, own, place[number].reshape(-1, 3))
 
 
-def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, split: _Split, keys: int | None) -> None:
+def _garment(document: _Document, name: str, vertices: np.ndarray, faces: np.ndarray, split: _Split, keys: int | None) -> None:
     """Add the garment: its mesh, a morph target for each later frame, and their weights over time."""
     frames, count = len(vertices), len(split.vertex)
 
@@ -220,15 +223,15 @@ def _garment(document: _Document, vertices: np.ndarray, faces: np.ndarray, split
         attributes[0]["TEXCOORD_0"] = document.array(split.uv.astype("<f4"), target=VERTICES)
     primitive = {"attributes": attributes[0], "indices": document.corners(split.faces, count)}
     if keys is None:
-        document.mesh("garment", primitive, CLOTH)
+        document.mesh(name, primitive, CLOTH)
         return
-    mesh = document.mesh("garment", primitive | {"targets": attributes[1:]}, CLOTH)
+    mesh = document.mesh(name, primitive | {"targets": attributes[1:]}, CLOTH)
     mesh["extras"] = {"targetNames": [f"frame_{t:04}" for t in range(1, frames)]}
     number = frames * (frames - 1)
     document.moved(0, "weights", keys, document.accessor(document.view(4 * number, weights), 0, FLOAT, number, "SCALAR"))
 
 
-def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int | None) -> None:
+def _body(document: _Document, name: str, body: BodyRecord, motion: MotionRecord, keys: int | None) -> None:
     """Add the body: its skin, joints and their movement. The joints' axes are the world's at rest, as in `skinning.forward`."""
     count, joints = body.weights.shape
     poses = motion.poses if body.rest_rotations is None else np.einsum("jab,tjb->tja", body.rest_rotations, motion.poses)
@@ -251,7 +254,7 @@ def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int
         attributes[f"JOINTS_{k // 4}"] = document.array(order[:, k : k + 4].astype("<u2"), target=VERTICES)
         attributes[f"WEIGHTS_{k // 4}"] = document.array(shares[:, k : k + 4].astype("<f4"), target=VERTICES)
     primitive = {"attributes": attributes, "indices": document.corners(body.faces, count)}
-    document.mesh("body", primitive, SKIN, skin=0)
+    document.mesh(name, primitive, SKIN, skin=0)
 
     first = len(document.nodes)
     inverse = np.tile(np.eye(4), (joints, 1, 1))
@@ -260,9 +263,9 @@ def _body(document: _Document, body: BodyRecord, motion: MotionRecord, keys: int
     document.skins.append({"joints": [*range(first, first + joints)], "inverseBindMatrices": document.array(columns)})
     document.roots.append(first)
     for j in range(joints):
-        name = body.joint_names[j] if body.joint_names else f"joint_{j}"
+        joint = body.joint_names[j] if body.joint_names else f"joint_{j}"
         place = path[0] if j == 0 else bones[j]
-        node = {"name": name, "translation": place.tolist(), "rotation": turns[0, j].tolist()}
+        node = {"name": joint, "translation": place.tolist(), "rotation": turns[0, j].tolist()}
         below = (first + np.flatnonzero(body.parents == j)).tolist()
         document.nodes.append(node | ({"children": below} if below else {}))
         if keys is not None and np.ptp(turns[:, j], axis=0).any():

@@ -163,17 +163,18 @@ def skinned_piece(gltf: Gltf, skin: int, drawn: Sequence[Drawn], shapes: Mapping
     inverse = inverse[: len(joints)].reshape(-1, 4, 4).swapaxes(1, 2)
     if np.abs(inverse[:, 3] - [0, 0, 0, 1]).max() > 1e-4:
         raise gltf.wrong("matrices with (0, 0, 0, 1) below expected", f"{where} inverseBindMatrices")
-    parts, start = [], 0
+    parts, maps, start = [], [], 0
     for d in drawn:
         x, faces = triangles_of(gltf, d, shapes)
         owners, weights = _influences(gltf, d, len(x), len(joints))
         uv = texture_coordinates(gltf, d, len(x))
-        parts.append((x, faces + start, owners, weights, None if uv is None else uv[faces]))
+        parts.append((x, faces + start, owners, weights))
+        maps.append(None if uv is None else uv[faces])
         start += len(x)
     width = max(p[2].shape[1] for p in parts)
     owners, weights = (np.concatenate([np.pad(p[k], ((0, 0), (0, width - p[k].shape[1]))) for p in parts]) for k in (2, 3))
     x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen, uv=together([p[4] for p in parts]))
+    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen, uv=together(maps))
 
 
 def _influences(gltf: Gltf, drawn: Drawn, count: int, joints: int) -> tuple[np.ndarray, np.ndarray]:

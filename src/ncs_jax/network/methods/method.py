@@ -189,7 +189,7 @@ def decode(
         raise InputError(f"offsets {expected} expected: vertices, axes, poses", field="decoder", value=f"shape {offsets.shape}")
     if swing is None or (vibrations := required(model.vibrations, "model.vibrations")).slope is not None:
         return offsets
-    return offsets + jnp.tensordot(vibrations.directions, swing, (-1, -1))
+    return offsets + jnp.tensordot(vibrations.directions, swing, (-1, -1), precision="highest")
 
 
 class FromCodes:

@@ -96,7 +96,7 @@ class NCS(FromCodes):
                 states = jnp.asarray(self.dynamic.apply(variables, every, rest, begins, method="of_motions"))
                 return Codes(fixed, jnp.where(begun[length - last :, :, None], states[inside[length - last :]], 0))
             pick = jax.nn.one_hot(inside, frames, dtype=every.dtype) * begun[..., None].astype(every.dtype)
-            features = jnp.einsum("lbf,fg->lbg", pick, every)
+            features = jnp.einsum("lbf,fg->lbg", pick, every, precision="highest")
         else:
             moving = jnp.where(begun[..., None, None], track.dynamic[inside], 0)
             features = jnp.asarray(self.dynamic.apply(variables, moving, method="features"))

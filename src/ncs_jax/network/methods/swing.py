@@ -18,6 +18,7 @@ swing, and every step is a descent.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import flax.linen as nn
 import jax
@@ -39,6 +40,8 @@ __all__ = ["Swing"]
 BLOCK = 32  # frames whose statics are posed together
 FEW = 8  # poses of which sums are faster as a product of matrices: ten times of one, but half as fast of 32
 QUIET = 0.02  # of a track's largest swing: a smaller one is not enlarged that far
+
+_matmul = partial(jnp.matmul, precision="highest")
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,8 @@ class Swing:
             previous, before = swing
             inverse, g, g1, g2, push, begins = frame
             previous, before = jnp.where(begins, 0, previous), jnp.where(begins, 0, before)
-            q = self.bounded(model, inverse @ (self.damping * h * (g @ previous) + 2 * (g1 @ previous) - g2 @ before - push))
+            past = self.damping * h * _matmul(g, previous) + 2 * _matmul(g1, previous) - _matmul(g2, before)
+            q = self.bounded(model, _matmul(inverse, past - push))
             return (q, previous), q
 
         zero = jnp.zeros(self.modes, push.dtype)
@@ -158,7 +162,7 @@ class Swing:
         slope = _vibrations(model).slope
         if slope is None:
             return q
-        square = jnp.sum(q * jnp.tensordot(slope, q, 1), axis=0, keepdims=True)
+        square = jnp.sum(q * jnp.tensordot(slope, q, 1, precision="highest"), axis=0, keepdims=True)
         return q / jnp.sqrt(jnp.sqrt(1 + square * square))
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
@@ -218,9 +222,9 @@ class Swing:
         along = (d * mass[:, None, None]).reshape(-1, self.modes)
         g = jnp.sum(along * d.reshape(along.shape), axis=0)
         along = along / g[None]
-        r = along.T @ moved.reshape(len(along), -1) - swing.T
+        r = _matmul(along.T, moved.reshape(len(along), -1)) - swing.T
         inertia, force = (g * model.fps**2)[:, None] * r, vibrations.energy * swing.T
-        return jnp.sum(r * (inertia / 2 - force), axis=0), (along @ (inertia - force)).reshape(moved.shape)
+        return jnp.sum(r * (inertia / 2 - force), axis=0), _matmul(along, inertia - force).reshape(moved.shape)
 
     def _static_garment(self, params, model, z, matrices):
         """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
@@ -260,7 +264,7 @@ def _product(model, p, q):
     """P^T M Q (modes, modes, poses)."""
     weighted = _mass(model)[:, None, None, None] * p
     if p.shape[-1] < FEW:
-        return jnp.einsum("vikp,vilp->klp", weighted, q)
+        return jnp.einsum("vikp,vilp->klp", weighted, q, precision="highest")
     return jnp.stack([jnp.sum(weighted[:, :, k, None] * q, axis=(0, 1)) for k in range(p.shape[2])])
 
 
