@@ -207,7 +207,7 @@ def steps_of_log(out):
 
 def test_minutes_choose_the_steps_and_too_few_are_warned_of(tmp_path, plain_jax):
     scene, seen, out = write_scene(tmp_path, FREE), [], tmp_path / "run"
-    with pytest.warns(InputWarning, match=r"0.001 minutes hold about 10 steps .*: too few .*; 300 steps take about \d+ m"):
+    with pytest.warns(InputWarning, match=r"0.001 minutes hold about 10 .*: too few .*; 300 steps in all take about \d+ m"):
         run = train(scene, out, minutes=0.001, report=seen.append)
     assert [r.step for r in seen] == [10] and run.steps == seen[-1].steps == 10
     assert seen[-1].validation is not None and seen[-1].left == 0
