@@ -354,7 +354,8 @@ def sheet(tmp_path, scene) -> np.ndarray:
     weights = np.zeros((len(garment.vertices), len(body.parents)))
     weights[:, 0] = 1
     record = load_motion(scene, "m.npz", body)
-    made: Any = SimpleNamespace(scene=scene, body=body, garment=garment, prepared=SimpleNamespace(weights=weights))
+    prepared, model = SimpleNamespace(weights=weights), SimpleNamespace(under=())
+    made: Any = SimpleNamespace(scene=scene, body=body, garment=garment, prepared=prepared, model=model)
     motion_sheet(tmp_path / "sheet.png", made, {"m.npz": record})
     return np.asarray(Image.open(tmp_path / "sheet.png")).astype(int)
 
