@@ -11,7 +11,7 @@ import numpy as np
 from ncs_jax.io.character.fbx import Record, read_fbx
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
 from ncs_jax.io.character.fbx_graph import FbxModel, Graph, euler, graph_of, name_of, properties_of
-from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_triangles
+from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_texture_coordinates, fbx_triangles
 from ncs_jax.io.character.rig import body_of, rig_from, together
 from ncs_jax.io.character.rig_motion import clip_named, first_that_moves, motion_of
 from ncs_jax.io.character.spline import key_rate
@@ -67,11 +67,10 @@ def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
             )
         parts, start = [], 0
         for d in worn:
-            (x, faces, uv), matrix = fbx_triangles(graph, d, {}), worlds[d.model]
+            (x, faces), matrix, uv = fbx_triangles(graph, d, {}), worlds[d.model], fbx_texture_coordinates(graph, d)
             step = 1 if np.linalg.det(matrix[:3, :3]) > 0 else -1
-            parts.append(
-                (x @ matrix[:3, :3].T + matrix[:3, 3], faces[:, ::step] + start, None if uv is None else uv[:, ::step])
-            )
+            placed = x @ matrix[:3, :3].T + matrix[:3, 3]
+            parts.append((placed, faces[:, ::step] + start, None if uv is None else uv[:, ::step]))
             start += len(x)
         x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
         return RawGarment(file, x, faces, together([p[2] for p in parts]))

@@ -13,7 +13,7 @@ from ncs_jax.io.character.rig import Piece
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes
 from ncs_jax.io.mesh.polygons import triangle_corners
 
-__all__ = ["FbxMesh", "fbx_meshes", "fbx_pieces", "fbx_triangles"]
+__all__ = ["FbxMesh", "fbx_meshes", "fbx_pieces", "fbx_texture_coordinates", "fbx_triangles"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,9 @@ def fbx_pieces(
     for name in shapes or {}:
         if name not in known:
             raise graph.fbx.wrong("no such shape", "body.shapes", name, f"the file has {', '.join(known)[:600] or 'none'}")
-    return [replace(_piece(graph, d, shapes or {}), chosen=c) for d, c in zip(drawn, chosen.tolist(), strict=True)]
+    pieces = [replace(_piece(graph, d, shapes or {}), chosen=c) for d, c in zip(drawn, chosen.tolist(), strict=True)]
+    maps = [fbx_texture_coordinates(graph, d) if worn and c else None for d, c in zip(drawn, chosen.tolist(), strict=True)]
+    return [replace(piece, uv=uv) for piece, uv in zip(pieces, maps, strict=True)]
 
 
 def _blend_shapes(graph: Graph, mesh: FbxMesh) -> dict[str, tuple[float, Record]]:
@@ -73,11 +75,14 @@ def _blend_shapes(graph: Graph, mesh: FbxMesh) -> dict[str, tuple[float, Record]
     return found
 
 
-def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return vertices (V, 3), moved by blend shapes, triangles (F, 3) and their texture coordinates (F, 3, 2), if any.
+def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3), moved by blend shapes, and triangles (F, 3) of a mesh, in its model's space."""
+    x, corners, cut = _cut(graph, mesh, shapes)
+    return x, corners[cut].astype(np.int32)
 
-    The vertices are in the space of the mesh's model.
-    """
+
+def _cut(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices (V, 3), the polygons' corners (N,), and triangles (F, 3) of places in these; see `fbx_triangles`."""
     fbx, model = graph.fbx, graph.models[mesh.model]
     where = f"mesh of {model.name}"
     x = fbx.array(mesh.record, "Vertices", where)
@@ -100,15 +105,13 @@ def fbx_triangles(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> t
     x = (x * scale) @ euler(model.vector("GeometricRotation")).T + model.vector("GeometricTranslation")
     counts = np.diff(np.flatnonzero(last), prepend=-1)
     area = np.repeat(counts > 2, counts)  # edges that stand by themselves are polygons of two corners
-    cut = np.flatnonzero(area)[triangle_corners(fbx.file, x, counts[counts > 2], corners[area])][
-        :, :: 1 if scale.prod() > 0 else -1
-    ]
-    uv = _texture_coordinates(graph, mesh, corners)
-    return x, corners[cut].astype(np.int32), None if uv is None else uv[cut]
+    cut = np.flatnonzero(area)[triangle_corners(fbx.file, x, counts[counts > 2], corners[area])]
+    return x, corners, cut if scale.prod() > 0 else cut[:, ::-1]
 
 
-def _texture_coordinates(graph: Graph, mesh: FbxMesh, corners: np.ndarray) -> np.ndarray | None:
-    """Return the first texture coordinates (N, 2) of polygons' corners (N,), or None."""
+def fbx_texture_coordinates(graph: Graph, mesh: FbxMesh) -> np.ndarray | None:
+    """Return the first texture coordinates (F, 3, 2) of a mesh's triangles, with the file's blend shapes, or None."""
+    _, corners, cut = _cut(graph, mesh, {})
     layer, where = mesh.record.first("LayerElementUV"), f"mesh of {graph.models[mesh.model].name} LayerElementUV"
     mapping = layer.first("MappingInformationType").value(0, str, "")
     by_corner, by_vertex = mapping == "ByPolygonVertex", mapping in ("ByVertice", "ByVertex")
@@ -123,14 +126,14 @@ def _texture_coordinates(graph: Graph, mesh: FbxMesh, corners: np.ndarray) -> np
         number = index[number]
     if len(table) % 2 or number.max() >= len(table) // 2:
         raise graph.fbx.wrong(f"{number.max() + 1} pairs expected", f"{where} UV", f"{len(table)} numbers")
-    return None if number.min() < 0 else table.reshape(-1, 2)[number]  # -1: the corner has none
+    return None if number.min() < 0 else table.reshape(-1, 2)[number[cut]]  # -1: the corner has none
 
 
 def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
     """Return the triangles of one mesh with the joints and weights of its skin."""
     fbx, model = graph.fbx, graph.models[mesh.model]
     where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
-    x, faces, uv = fbx_triangles(graph, mesh, shapes)
+    x, faces = fbx_triangles(graph, mesh, shapes)
     rows: list[tuple[np.ndarray, np.ndarray]] = []
     nodes, binds, bounds = [], [], []
     for key, cluster, _ in graph.under(mesh.skin or 0, "Deformer", "Cluster"):
@@ -160,4 +163,4 @@ def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
     owners[vertex, slot], weights[vertex, slot] = owner, np.maximum(weight, 0)
     sums = weights.sum(axis=1, keepdims=True)
     weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
-    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0], uv=uv)
+    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])

@@ -109,10 +109,9 @@ def gltf_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         parts, start = [], 0
         for d in worn:
             x, faces = triangles_of(gltf, d, {})
-            faces, uv = oriented(faces, worlds[d.node]), texture_coordinates(gltf, d, len(x))
-            parts.append(
-                (x @ worlds[d.node, :3, :3].T + worlds[d.node, :3, 3], faces + start, None if uv is None else uv[faces])
-            )
+            faces = oriented(faces, worlds[d.node])
+            placed = x @ worlds[d.node, :3, :3].T + worlds[d.node, :3, 3]
+            parts.append((placed, faces + start, texture_coordinates(gltf, d, faces, len(x))))
             start += len(x)
         x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
         return RawGarment(gltf.file, x, faces, together([p[2] for p in parts]), splits=True)
@@ -229,7 +228,15 @@ def _pieces(
     found: dict[tuple[int, bool], list[Drawn]] = {}
     for one, wanted in zip(drawn, chosen.tolist(), strict=True):
         found.setdefault((one.skin, wanted), []).append(one)
-    return [skinned_piece(gltf, skin, some, shapes or {}, wanted) for (skin, wanted), some in found.items()]
+    pieces = [skinned_piece(gltf, skin, some, shapes or {}, wanted) for (skin, wanted), some in found.items()]
+    maps = [_mapped(gltf, some) if worn and wanted else None for (_, wanted), some in found.items()]
+    return [replace(piece, uv=uv) for piece, uv in zip(pieces, maps, strict=True)]
+
+
+def _mapped(gltf: Gltf, drawn: Sequence[Drawn]) -> np.ndarray | None:
+    """Return the texture coordinates (F, 3, 2) of primitives, None where one has none."""
+    triangles = [triangles_of(gltf, d, {}) for d in drawn]
+    return together([texture_coordinates(gltf, d, faces, len(x)) for d, (x, faces) in zip(drawn, triangles, strict=True)])
 
 
 def _animation(gltf: Gltf, nodes: Nodes, name: str) -> tuple[list[Channel], tuple[str, ...]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.io.character.draco import unpack_draco
 from ncs_jax.io.character.gltf import Gltf
-from ncs_jax.io.character.rig import Piece, together
+from ncs_jax.io.character.rig import Piece
 from ncs_jax.io.mesh.part import NamedMesh
 
 __all__ = [
@@ -140,13 +140,13 @@ def oriented(faces: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return faces if np.linalg.det(matrix[:3, :3]) > 0 else faces[:, ::-1]
 
 
-def texture_coordinates(gltf: Gltf, drawn: Drawn, count: int) -> np.ndarray | None:
-    """Return the first texture coordinates (V, 2) of a primitive, v upward, or None."""
+def texture_coordinates(gltf: Gltf, drawn: Drawn, faces: np.ndarray, count: int) -> np.ndarray | None:
+    """Return the first texture coordinates of the corners of faces (F, 3), (F, 3, 2), v upward, or None."""
     attributes = gltf.object("attributes", drawn.tree, drawn.where)
     if "TEXCOORD_0" not in attributes:
         return None
     uv = floats_of(gltf, attributes, "TEXCOORD_0", drawn.where, ("VEC2",))
-    return uv * [1, -1] + [0, 1] if len(uv) == count else None
+    return (uv * [1, -1] + [0, 1])[faces] if len(uv) == count else None
 
 
 def skinned_piece(gltf: Gltf, skin: int, drawn: Sequence[Drawn], shapes: Mapping[str, float], chosen: bool) -> Piece:
@@ -163,18 +163,16 @@ def skinned_piece(gltf: Gltf, skin: int, drawn: Sequence[Drawn], shapes: Mapping
     inverse = inverse[: len(joints)].reshape(-1, 4, 4).swapaxes(1, 2)
     if np.abs(inverse[:, 3] - [0, 0, 0, 1]).max() > 1e-4:
         raise gltf.wrong("matrices with (0, 0, 0, 1) below expected", f"{where} inverseBindMatrices")
-    parts, maps, start = [], [], 0
+    parts, start = [], 0
     for d in drawn:
         x, faces = triangles_of(gltf, d, shapes)
         owners, weights = _influences(gltf, d, len(x), len(joints))
-        uv = texture_coordinates(gltf, d, len(x))
         parts.append((x, faces + start, owners, weights))
-        maps.append(None if uv is None else uv[faces])
         start += len(x)
     width = max(p[2].shape[1] for p in parts)
     owners, weights = (np.concatenate([np.pad(p[k], ((0, 0), (0, width - p[k].shape[1]))) for p in parts]) for k in (2, 3))
     x, faces = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen, uv=together(maps))
+    return Piece(x, faces, owners, weights, joints, inverse, chosen=chosen)
 
 
 def _influences(gltf: Gltf, drawn: Drawn, count: int, joints: int) -> tuple[np.ndarray, np.ndarray]:
