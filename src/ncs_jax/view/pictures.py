@@ -20,6 +20,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
+from ncs_jax.view.heading import heading
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 __all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet"]
@@ -58,8 +59,10 @@ class _Stage:
         return Ground(self.floor, (self.path[frame, 0], self.path[frame, 2]), radius)
 
     def heading(self, frame: int) -> float:
-        """Return how far the character has turned about Y since the first frame, degrees: the best fit in x and z."""
+        """Return how far the character is turned about Y, degrees: by its trunk, else since the first frame, by its outline."""
         body = self.animation.body
+        if body is not None and body.axes is not None:
+            return heading(body.axes[frame])
         x = self.animation.garment if body is None else body.vertices
         first, now = x[0], x[frame]
         good = _drawable(first).all(1) & _drawable(now).all(1)
