@@ -122,7 +122,6 @@ def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.n
     return (np.asarray(vertices) @ turn.T).astype(np.asarray(vertices).dtype)
 
 
-
 def upright_axes(axes: np.ndarray, up: Sequence[float]) -> np.ndarray:
     """Turn matrices (..., 3, 3) whose columns are directions, as `upright` turns vertices."""
     return np.swapaxes(upright(np.swapaxes(axes, -1, -2), up), -1, -2)
