@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ncs_jax import io
+from ncs_jax.energies.terms import OwnTerm, Terms
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.network.methods.method import Method, initial_parameters
@@ -26,6 +28,7 @@ from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
+from ncs_jax.scene.step_inputs import step_inputs
 
 __all__ = ["Assembly", "build", "features_from_records"]
 
@@ -57,6 +60,7 @@ def build(
     *,
     prepared: Prepared | None = None,
     below: Sequence[Below] = (),
+    terms: Sequence[OwnTerm] = (),
     dtype=jnp.float32,
     report: Callable[[str], None] | None = None,
 ) -> Assembly:
@@ -64,12 +68,13 @@ def build(
 
     Args:
         scene: from `load_scene`. prepared: that of a run, which needs no training motion any more; None: it is found out here.
-        below: the trained garments of `garment.over`, each with the body that it was trained on.
+        below: the trained garments of `garment.over`, each with the body that it was trained on. terms: of one's own.
         dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words; without
             one, what takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
 
     Raises:
-        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+        InputError: a file is unusable, joint counts disagree, units are off, the garment is not on the body, or a term needs a
+            past that a swing trains without.
     """
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
     automatic, scene = scene.network.cell == "auto", setting.scene
@@ -83,10 +88,23 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
+            _check_static(model, terms, known)  # before a minute is spent
             prepared = _with_vibrations(scene, prepared, model, faces, known, report or _tell_a_person)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
-    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network_from(scene, model), track)
+    network = network_from(scene, model)
+    model = model.with_terms(terms) if terms else model
+    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track)
+
+
+def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
+    """Raise an InputError where a term of one's own does not do without a past; nothing is computed."""
+    own, alone = model.with_terms(terms), Terms(None, False, None, gravity=False, inertia=False, own=tuple(terms))
+
+    def energies(x, matrices):
+        return energy_terms(x, model.garment, model.material, step_inputs(own, matrices), alone)
+
+    jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
 def _training_features(setting: Setting) -> MotionFeatures:

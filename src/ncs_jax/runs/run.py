@@ -17,7 +17,7 @@ from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
-from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.method import Method, check_network
 from ncs_jax.network.rollout import animated, first_broken
 from ncs_jax.prepare.build import Assembly, build, features_from_records
 from ncs_jax.prepare.motion_import import load_motion
@@ -215,14 +215,17 @@ def assemble(
     What takes long are the vibrations of `network.cell = "swing"`. Energies need none: with "gated" none are looked for.
 
     Raises:
-        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+        InputError: a file is unusable, joint counts disagree, units are off, the garment is not on the body, or a term or the
+            network does not fit.
     """
     if network is not None and scene.network.cell == "auto":  # one's own needs no vibrations, unless the scene asks for them
         scene = replace(scene, network=replace(scene.network, cell="gated"))
-    assembly = build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report)
-    if terms:
-        assembly = replace(assembly, model=assembly.model.with_terms(terms))
-    return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
+    assembly = build(scene, prepared=prepared, below=worn_below(scene), terms=terms, dtype=dtype, report=report)
+    if network is None:
+        return assembly
+    made = network(scene, assembly.model)
+    check_network(made, assembly.model)
+    return replace(assembly, network=made)
 
 
 def worn_below(scene: Scene) -> list[Below]:
