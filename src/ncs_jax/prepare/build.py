@@ -30,7 +30,7 @@ from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
 
-__all__ = ["Assembly", "build", "features_from_records"]
+__all__ = ["Assembly", "build", "features_from_records", "tell_a_person"]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
@@ -46,7 +46,7 @@ class Assembly(Setting):
 
     @property
     def track(self) -> MotionFeatures:
-        """Return all training motions end to end.
+        """Return all training motions end to end, in the order of the scene's files, then their mirror images if any.
 
         Raises:
             InputError: the scene is that of a loaded run, which is made ready without them.
@@ -89,7 +89,7 @@ def build(
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
             _check_static(model, terms, known)  # before a minute is spent
-            prepared = _with_vibrations(scene, prepared, model, faces, known, report or _tell_a_person)
+            prepared = _with_vibrations(scene, prepared, model, faces, known, report or tell_a_person)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
     network = network_from(scene, model)
@@ -125,7 +125,7 @@ def _training_features(setting: Setting) -> MotionFeatures:
     return features_from_records(model, *motions)
 
 
-def _tell_a_person(words: str) -> None:
+def tell_a_person(words: str) -> None:
     """Write what takes long to stderr, where a person sees it: in a terminal or a notebook."""
     shell = sys.modules.get("IPython")
     if sys.stderr.isatty() or (shell is not None and shell.get_ipython() is not None):

@@ -207,8 +207,8 @@ def assemble(
 
     Args:
         scene: from `load_scene`. prepared: of a run, which needs no training motion any more; else found out here.
-        terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: makes a network of one's own from scene
-            and model, see `network.methods.method.Method`; else the scene's.
+        terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: a function of one's own,
+            (scene, model) -> network, see `network.methods.method.Method`; else the scene's.
         dtype: of everything; float64 needs JAX's x64 mode. report: called with what is done next, in words; without one, what
             takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
 

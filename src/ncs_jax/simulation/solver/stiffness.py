@@ -87,13 +87,13 @@ def _membrane(x, mesh: Mesh, density, numbers):
     shape = jnp.stack([-mesh.face_axes[:, 0] - mesh.face_axes[:, 1], mesh.face_axes[:, 0], mesh.face_axes[:, 1]])
     k, other = np.array([(corner, corner) for corner in range(3)] + [*FACE]).T
     # w_i = sum_k shape_ki x_k
-    weight = {(i, j): area * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
-    even = sum((weight[i, j] * pull[i, j] for i, j in weight), start=jnp.zeros_like(area))
-    blocks = even[..., None, None] * eye
+    weight = {(i, j): area[None] * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
+    even = sum((weight[i, j] * pull[i, j][None] for i, j in weight), start=jnp.zeros_like(weight[0, 0]))
+    blocks = even[..., None, None] * eye[None, None]
     for a in range(2):
         for b in range(2):
-            within = sum((weight[i, j] * material[i, a, j, b] for i, j in weight), start=jnp.zeros_like(area))
-            blocks = blocks + within[..., None, None] * (axes[a, :, :, None] * axes[b, :, None, :])
+            within = sum((weight[i, j] * material[i, a, j, b][None] for i, j in weight), start=jnp.zeros_like(even))
+            blocks = blocks + within[..., None, None] * (axes[a, :, :, None] * axes[b, :, None, :])[None]
     return blocks
 
 
