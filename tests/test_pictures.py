@@ -201,6 +201,18 @@ def test_contact_sheet(tmp_path, swing):
     assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 2
 
 
+def test_animations_are_drawn_below_each_other(tmp_path, swing):
+    still = replace(swing, garment=np.repeat(swing.garment[:1], len(swing.garment), axis=0))
+    pictures.contact_sheet(tmp_path / "a.png", {"network": swing, "simulation": still, "rest": still}, frames=2, tile=100)
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    cloth = picture[..., 0] - picture[..., 2] > 60
+    assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 3
+    first, second, third = (picture[40 + 100 * row : 140 + 100 * row, 56:-56] for row in range(3))
+    assert (first != second).any() and (second == third).all()
+    with pytest.raises(InputError, match="as many frames"):
+        pictures.contact_sheet(tmp_path / "a.png", {"network": swing, "simulation": swing.until(4)})
+
+
 def test_a_garment_worn_below_is_blue(tmp_path, swing):
     def blue(worn):
         dressed = replace(swing, body=replace(swing.body, worn=worn))
