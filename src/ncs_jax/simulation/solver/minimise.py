@@ -116,6 +116,38 @@ def relax_patch(problem: Problem, x: Float[Array, "verts 3"], neighbours, left: 
     return x, neighbours, count
 
 
+def _settled(problem: Problem, judged, x, known, stale):
+    """Evaluate where what is known is stale, and find what is near anew before it can no longer be trusted.
+
+    That is in any case before the frame is done. The program has the evaluation once.
+
+    Args:
+        judged: returns status and what is left. known: point, neighbours, status, what is left. stale: whether x is another
+            place than the point's; None: it never is.
+    """
+
+    def far(neighbours, status):
+        if neighbours is None:
+            return jnp.asarray(False)
+        done = (status == CONVERGED) | (status == STALLED)
+        return max_displacement(x, neighbours.found_at) > jnp.where(done, 0, trust_radius(problem, x) / 2)
+
+    def unsettled(state):
+        _, neighbours, status, _, stale = state
+        return far(neighbours, status) if stale is None else stale | far(neighbours, status)
+
+    def again(state):
+        _, neighbours, _, _, stale = state
+        if stale is None:
+            neighbours = find_neighbours(problem, x)
+        elif neighbours is not None:
+            neighbours = lax.cond(stale, lambda: neighbours, lambda: find_neighbours(problem, x))
+        point = evaluate(with_neighbours(problem, neighbours), x)
+        return point, neighbours, *judged(point, False, x), None if stale is None else jnp.asarray(False)
+
+    return lax.while_loop(unsettled, again, (*known, stale))[:4]
+
+
 def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
     """Return positions that minimise the energy, found from `start`, and how the solve went."""
     direction = DIRECTIONS[settings.solver]
@@ -144,35 +176,8 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         else:
             stale = None
         if neighbours is not None or stale is not None:
-            point, neighbours, status, left = settled(x, (point, neighbours, status, left), stale)
+            point, neighbours, status, left = _settled(problem, judged, x, (point, neighbours, status, left), stale)
         return x, point, memory, neighbours, status, left, iteration + 1
-
-    def settled(x, known, stale):
-        """Evaluate where what is known is stale, and find what is near anew before it can no longer be trusted.
-
-        That is in any case before the frame is done. The program has the evaluation once.
-        """
-
-        def far(neighbours, status):
-            if neighbours is None:
-                return jnp.asarray(False)
-            done = (status == CONVERGED) | (status == STALLED)
-            return max_displacement(x, neighbours.found_at) > jnp.where(done, 0, trust_radius(problem, x) / 2)
-
-        def unsettled(state):
-            _, neighbours, status, _, stale = state
-            return far(neighbours, status) if stale is None else stale | far(neighbours, status)
-
-        def again(state):
-            _, neighbours, _, _, stale = state
-            if stale is None:
-                neighbours = find_neighbours(problem, x)
-            elif neighbours is not None:
-                neighbours = lax.cond(stale, lambda: neighbours, lambda: find_neighbours(problem, x))
-            point = evaluate(with_neighbours(problem, neighbours), x)
-            return point, neighbours, *judged(point, False, x), None if stale is None else jnp.asarray(False)
-
-        return lax.while_loop(unsettled, again, (*known, stale))[:4]
 
     def judged(point, stuck, p):
         left = out_of_balance(point.gradient, problem.mass)
@@ -183,7 +188,7 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     neighbours = refresh_neighbours(problem, start, problem.neighbours)
     point = evaluate(with_neighbours(problem, neighbours), start)
     status, left = judged(point, False, start)
-    if neighbours is not None:  # as `settled` would, but without a program of its own: one step is taken in any case
+    if neighbours is not None:  # as `_settled` would, but without a program of its own: one step is taken in any case
         status = jnp.where((status == CONVERGED) & (max_displacement(start, neighbours.found_at) > 0), -1, status)
     memory = direction.begin(with_neighbours(problem, neighbours), start, point)
     state = (start, point, memory, neighbours, status, left, jnp.zeros((), jnp.int32))
