@@ -21,7 +21,7 @@ from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.runs.run import assemble
-from ncs_jax.scene.features import input_joints, mirror, motion_features
+from ncs_jax.scene.features import MotionFeatures, input_joints, mirror, motion_features
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
 
@@ -75,6 +75,20 @@ def test_a_mirrored_motion_is_the_mirror_image(rng, axis):
     turned = np.asarray(here.rotations)[:, PARTNER] * reflect[:, None] * reflect
     np.testing.assert_allclose(there.rotations, turned, atol=1e-13)
     assert np.abs(np.asarray(there.positions) - np.asarray(here.positions)).max() > 0.1
+
+
+def test_a_track_prints_in_a_line_which_frames_are_which_motion():
+    def shown(*lengths):
+        start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths).astype(np.int32)
+        frames = len(start)
+        numbers = np.zeros((frames, 2, 9)), np.zeros((frames, 2, 12)), np.zeros((frames, 3, 3, 4))
+        return MotionFeatures(*map(jnp.asarray, (*numbers, start)))
+
+    assert repr(shown(4, 3)) == "MotionFeatures(7 frames, 3 joints, 2 motions: frames 0 to 3, 4 to 6)"
+    assert len(repr(shown(*[2] * 50))) < 120 and repr(shown(*[2] * 50)).endswith("..., 98 to 99)")
+    inside = []
+    jax.make_jaxpr(lambda track: inside.append(repr(track)) or track.start)(shown(2))
+    assert inside[0].startswith("MotionFeatures(start=")  # traced: no numbers to tell
 
 
 def test_the_mirrored_character_wears_its_skin_mirrored(rng):

@@ -100,12 +100,14 @@ def test_own_terms(tmp_path, whole):
     if whole:
         notebook, printed = ran("own_terms", tmp_path, SHORT)
     else:
-        notebook, printed = ran_small("own_terms", tmp_path, SHORT, *hung(tmp_path))
+        notebook, printed = ran_small("own_terms", tmp_path, SHORT, ("track, 5,", "track, 3,"), *hung(tmp_path))
     every = "".join(printed)
     assert "'wind'" in every and "'attachment'" in every and drawn(notebook) == 1
     pushed = float(every.split("the wind's force: [")[1].split()[0])
     assert pushed == pytest.approx(float(every.split("pressure times area: ")[1].split()[0]), rel=1e-3)
     assert float(every.split("moves the simulated skirt by ")[1].split()[0]) > (5 if whole else 2)
+    pulled = float(every.split("the air's force on a skirt at rest: [")[1].split()[0])
+    assert pulled == pytest.approx(float(every.split("c A w: ")[1].split()[0]), rel=1e-3)
     assert float(every.split("out of balance by at most ")[1].split()[0]) <= 0.1
 
 
@@ -117,5 +119,6 @@ def test_own_network(tmp_path, whole):
         _, printed = ran_small("own_network", tmp_path, SHORT, *hung(tmp_path, FREE))
     every = "".join(printed)
     counts = [int(line.split(": ")[1].split()[0]) for line in every.splitlines() if "parameters" in line]
+    assert "TanhEncoder: a code of" in every
     assert len(set(counts)) == 2 and (not whole or counts[1] < counts[0] / 2)
     assert float(every.split("largest difference ")[1].split()[0]) < 1e-5

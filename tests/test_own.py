@@ -19,6 +19,7 @@ from ncs_jax.energies.terms import MEASURED, NAMES, StepInputs, Terms
 from ncs_jax.energies.total import energy_terms
 from ncs_jax.metrics.motion import MEASURES
 from ncs_jax.metrics.quality import QUANTITIES
+from ncs_jax.network.encoders import DynamicEncoder
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.training.step import chunk_runner, initial_state
 
@@ -218,6 +219,71 @@ def test_a_decoder_with_axes_in_another_order_is_named(folder, plain_jax):
 
     with pytest.raises(InputError, match=r"decoder: offsets .* vertices, axes, poses"):
         ncs_jax.train(scene(folder), None, steps=10, network=turned)
+
+
+class Encoder(nn.Module):
+    """A static encoder that has no `sizes`."""
+
+    code: int
+    frames: bool = True
+
+    @nn.compact
+    def __call__(self, descriptors):
+        flat = descriptors.reshape(*descriptors.shape[:-2], -1) if self.frames else descriptors.reshape(-1)
+        return nn.tanh(nn.Dense(self.code)(flat))
+
+
+def test_an_encoder_of_ones_own_is_measured_and_not_asked(folder, plain_jax):
+    def encoded(scene, model):
+        made = network_from(scene, model)
+        return replace(made, static=Encoder(made.dynamic.state))
+
+    run = ncs_jax.train(scene(folder), None, steps=10, network=encoded)
+    kernel = run.params["static"]["Dense_0"]["kernel"]
+    assert kernel.shape[1] == run.assembly.network.code_size(run.assembly.model) == run.assembly.network.dynamic.state
+    assert np.isfinite(run.animate(str(folder / "swing.npz"))).all()
+
+
+class Lacking(DynamicEncoder):
+    """A dynamic encoder that asks for what it has not."""
+
+    def by_frame(self, descriptor):
+        return self.nothing(descriptor)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda made: replace(made, static=Encoder(made.dynamic.state + 1)), r"dynamic encoder: codes as long as the static"),
+        (
+            lambda made: replace(made, static=Encoder(8, frames=False)),
+            r"static encoder: codes \(\*frames, code\).*leading axes",
+        ),
+        (lambda made: replace(made, dynamic=Lacking((8,), (16,), 16)), r"network: .*has no attribute .*own_network\.ipynb"),
+    ],
+)
+def test_an_encoder_that_does_not_fit_is_refused_at_once(folder, plain_jax, change, match):
+    def wrong(scene, model):
+        return change(network_from(scene, model))
+
+    with pytest.raises(InputError, match=match):
+        ncs_jax.assemble(scene(folder), network=wrong)
+
+
+def test_a_term_of_the_velocity_is_refused_before_vibrations_are_looked_for(folder, plain_jax, monkeypatch):
+    def drag(x, step):
+        return jnp.sum((x - step.previous) ** 2)
+
+    def looked(*_):
+        raise AssertionError("vibrations were looked for")
+
+    monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", looked)
+    pinned = tomllib.loads(SCENE)["garment"] | {"pins": "pins"}
+    swings = scene(folder, garment=pinned, network={"cell": "swing"})
+    with pytest.raises(InputError, match=r"terms: drag: .*network\.cell = 'gated'"):
+        ncs_jax.assemble(swings, terms=[push, drag])
+    with pytest.raises(AssertionError, match="looked for"):  # by terms that do without
+        ncs_jax.assemble(swings, terms=[push, hook])
 
 
 def test_a_motion_as_arrays_is_animated(folder, trained, plain_jax):

@@ -22,10 +22,11 @@ from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.posing import skinned
 from ncs_jax.scene.spec import scene_from
 from ncs_jax.view import curves, pictures
-from ncs_jax.view.animation import Animation, PosedBody, upright
+from ncs_jax.view.animation import Animation, PosedBody, upright, upright_axes
 from ncs_jax.view.camera import Camera
-from ncs_jax.view.character import body_vertices
+from ncs_jax.view.character import body_vertices, posed_body
 from ncs_jax.view.ground import Ground
+from ncs_jax.view.heading import heading, trunk_axes
 from ncs_jax.view.motion_sheet import MARGIN, TILE, TITLE, motion_sheet, posed
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
@@ -200,6 +201,18 @@ def test_contact_sheet(tmp_path, swing):
     assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 2
 
 
+def test_animations_are_drawn_below_each_other(tmp_path, swing):
+    still = replace(swing, garment=np.repeat(swing.garment[:1], len(swing.garment), axis=0))
+    pictures.contact_sheet(tmp_path / "a.png", {"network": swing, "simulation": still, "rest": still}, frames=2, tile=100)
+    picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    cloth = picture[..., 0] - picture[..., 2] > 60
+    assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 3
+    first, second, third = (picture[40 + 100 * row : 140 + 100 * row, 56:-56] for row in range(3))
+    assert (first != second).any() and (second == third).all()
+    with pytest.raises(InputError, match="as many frames"):
+        pictures.contact_sheet(tmp_path / "a.png", {"network": swing, "simulation": swing.until(4)})
+
+
 def test_a_garment_worn_below_is_blue(tmp_path, swing):
     def blue(worn):
         dressed = replace(swing, body=replace(swing.body, worn=worn))
@@ -218,6 +231,42 @@ def test_contact_sheet_turns_with_the_character(tmp_path, swing):
     stage = pictures._stage(Animation(np.stack([vertices, vertices @ turn.T]), swing.garment_faces, 30.0))
     assert stage.heading(1) == pytest.approx(90, abs=1e-3)
     assert stage.bounds(1, 90.0)[3] == pytest.approx(stage.bounds(0, 0.0)[3], rel=1e-5)
+
+
+def striding(angles: np.ndarray, turn: np.ndarray) -> PosedBody:
+    """The packaged body in strides: legs and arms swing by angles, rad, the other way on the other side; turned about up."""
+    body = io.read_body(packaged("body"))
+    poses = np.zeros((len(angles), len(body.parents), 3))
+    for name, sign in (("LeftUpLeg", 1), ("RightUpLeg", -1), ("LeftArm", -1), ("RightArm", 1)):
+        poses[:, body.joint_names.index(name), 0] = sign * angles
+    poses[:, 0, 1] = turn
+    assembly: Any = SimpleNamespace(body=body, model=SimpleNamespace(under=()))
+    posed_there = posed_body(assembly, io.MotionRecord(poses, np.zeros((len(angles), 3)), 30.0))
+    assert posed_there is not None
+    return posed_there
+
+
+def test_a_long_stride_is_seen_from_the_side_that_it_is_seen_from(plain_jax):
+    """Left and right leg ahead by turns: the outline turns by a quarter and more, the character does not."""
+    angles, turn = np.array([0.8, -0.8, 0.0, 0.8, -0.8]), np.radians([0.0, 0.0, 60.0, 60.0, -120.0])
+    body = striding(angles, turn)
+    cloth = np.repeat(tube(3, 9, 0.3, 0.5, 1.0)[0][None], 5, axis=0)
+    shown = Animation(cloth, tube(3, 9, 0.3, 0.5, 1.0)[1], 30.0, body)
+    found = [pictures._stage(shown).heading(k) for k in range(5)]
+    np.testing.assert_allclose(found, np.degrees(turn), atol=1e-3)
+    assert abs(pictures._stage(replace(shown, body=replace(body, axes=None))).heading(1)) > 45  # by its outline
+    np.testing.assert_allclose([heading(each) for each in shown.until(4).every(3).body.axes], [0, 60], atol=1e-3)
+
+
+def test_a_character_with_z_up_is_seen_from_its_front():
+    """Standing and bent over, facing -Y at rest as Blender's do, and turned."""
+    names = ("Hips", "Spine", "Head", "LeftArm", "RightArm", "LeftUpLeg", "RightUpLeg")
+    joints = np.array([[0, 0, 1], [0, 0, 1.2], [0, 0, 1.6], [0.2, 0, 1.5], [-0.2, 0, 1.5], [0.1, 0, 0.9], [-0.1, 0, 0.9]])
+    body = io.BodyRecord(joints, np.zeros((0, 3), int), joints, np.array([-1, 0, 1, 1, 1, 0, 0]), np.eye(7), names)
+    for bent in (0.0, 80.0):
+        about = Rotation.from_euler("xz", [bent, 50.0], degrees=True).as_matrix()
+        axes = trunk_axes(body, np.broadcast_to(about, (1, 7, 3, 3)))
+        assert heading(upright_axes(axes, (0, 0, 1))[0]) == pytest.approx(50, abs=1e-6)
 
 
 def test_animation_gif(tmp_path, swing):

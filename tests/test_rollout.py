@@ -90,7 +90,7 @@ def test_many_characters_move_by_themselves(monkeypatch):
 def test_one_linear_map_for_inference():
     assembly, params, _ = ready()
     model, network = assembly.model, assembly.network
-    z = jax.random.normal(jax.random.PRNGKey(2), (7, network.static.sizes[-1]), jnp.float64)
+    z = jax.random.normal(jax.random.PRNGKey(2), (7, network.code_size(model)), jnp.float64)
     merged, merged_params = for_inference(network, params, model)
     assert merged.decoder.modes == 0 and network.decoder.modes == 6
     np.testing.assert_allclose(decode(merged, merged_params, model, z), decode(network, params, model, z), rtol=0, atol=1e-13)

@@ -129,6 +129,11 @@ def test_broken_input_is_one_line(tmp_path, capsys):
     assert "simulation.substeps" in lines[1]
 
 
-def test_a_motion_may_be_named(scene, unbroken):
+def test_a_motion_may_be_named_and_who_waits_is_told_why(scene, unbroken, monkeypatch):
+    told, reports = [], []
+    monkeypatch.setattr(simulation, "tell_a_person", told.append)
     again = simulate(load_scene(scene), str(scene.parent / "swing.npz"))
     np.testing.assert_array_equal(again.vertices, unbroken.vertices)
+    assert len(told) == 1 and told[0].startswith("compiling") and "of 24" in told[0]
+    simulate(load_scene(scene), str(scene.parent / "swing.npz"), report=reports.append)
+    assert len(told) == 1 and [p.compiling for p in reports] == [True] + 24 * [False]

@@ -41,7 +41,7 @@ def simulate(options) -> int:
     with WorkProgress("reading the scene") as progress:
 
         def show(p):
-            if p.begins:
+            if p.compiling:
                 progress.say(f"compiling, then frame {p.frame + 1} of {p.frames}")
                 return
             how = f"{p.iterations} iterations, {p.residual:.3g} g out of balance"

@@ -51,7 +51,7 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
 
     `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`), the root's
     translation (3,) in m and alpha, and returns the state and the garment's vertices (verts, 3) in m. Frame for frame it gives
-    what `animate` gives.
+    what `animate` gives. Pass alpha as a float: for 1 in the place of 1.0 `jax.jit` compiles the step again.
 
     With a state from `init(256)` all these have a leading axis, of characters who move by themselves; alpha is one number or
     one for each. That is several times as fast as `jax.vmap(step)`, since what they share is read once for many of them.

@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ncs_jax import io
+from ncs_jax.energies.terms import OwnTerm, Terms
+from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.network.methods.method import Method
@@ -26,8 +28,9 @@ from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
+from ncs_jax.scene.step_inputs import step_inputs
 
-__all__ = ["Assembly", "build", "features_from_records"]
+__all__ = ["Assembly", "build", "features_from_records", "tell_a_person"]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
@@ -43,7 +46,7 @@ class Assembly(Setting):
 
     @property
     def track(self) -> MotionFeatures:
-        """Return all training motions end to end.
+        """Return all training motions end to end, in the order of the scene's files, then their mirror images if any.
 
         Raises:
             InputError: the scene is that of a loaded run, which is made ready without them.
@@ -57,6 +60,7 @@ def build(
     *,
     prepared: Prepared | None = None,
     below: Sequence[Below] = (),
+    terms: Sequence[OwnTerm] = (),
     dtype=jnp.float32,
     report: Callable[[str], None] | None = None,
     ahead: Callable[[Assembly], None] | None = None,
@@ -65,13 +69,14 @@ def build(
 
     Args:
         scene: from `load_scene`. prepared: that of a run, which needs no training motion any more; None: it is found out here.
-        below: the trained garments of `garment.over`, each with the body that it was trained on.
+        below: the trained garments of `garment.over`, each with the body that it was trained on. terms: of one's own.
         dtype: of all arrays; float64 needs JAX's x64 mode. report: called with what is done next, in words; without
             one, what takes long is told on stderr in a terminal or a notebook, and nothing elsewhere.
         ahead: called before vibrations are looked for, with what is expected: zeros in their place.
 
     Raises:
-        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+        InputError: a file is unusable, joint counts disagree, units are off, the garment is not on the body, or a term needs a
+            past that a swing trains without.
     """
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
     automatic, scene = scene.network.cell == "auto", setting.scene
@@ -85,16 +90,29 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
+            _check_static(model, terms, known)  # before a minute is spent
 
             def begin() -> None:
-                (report or _tell_a_person)("finding the garment's vibrations, which may take a minute")
+                (report or tell_a_person)("finding the garment's vibrations, which may take a minute")
                 if ahead is not None:
-                    ahead(_expected(setting, model, known))
+                    ahead(_expected(setting, model.with_terms(terms) if terms else model, known))
 
             prepared = _with_vibrations(scene, prepared, model, faces, known, begin)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
-    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network_from(scene, model), track)
+    network = network_from(scene, model)
+    model = model.with_terms(terms) if terms else model
+    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track)
+
+
+def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
+    """Raise an InputError where a term of one's own does not do without a past; nothing is computed."""
+    own, alone = model.with_terms(terms), Terms(None, False, None, gravity=False, inertia=False, own=tuple(terms))
+
+    def energies(x, matrices):
+        return energy_terms(x, model.garment, model.material, step_inputs(own, matrices), alone)
+
+    jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
 def _training_features(setting: Setting) -> MotionFeatures:
@@ -115,7 +133,7 @@ def _training_features(setting: Setting) -> MotionFeatures:
     return features_from_records(model, *motions)
 
 
-def _tell_a_person(words: str) -> None:
+def tell_a_person(words: str) -> None:
     """Write what takes long to stderr, where a person sees it: in a terminal or a notebook."""
     shell = sys.modules.get("IPython")
     if sys.stderr.isatty() or (shell is not None and shell.get_ipython() is not None):

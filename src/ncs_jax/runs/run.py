@@ -17,7 +17,7 @@ from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
-from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.method import Method, check_network
 from ncs_jax.network.rollout import animated, first_broken
 from ncs_jax.prepare.build import Assembly, build, features_from_records
 from ncs_jax.prepare.motion_import import load_motion
@@ -208,8 +208,8 @@ def assemble(
 
     Args:
         scene: from `load_scene`. prepared: of a run, which needs no training motion any more; else found out here.
-        terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: makes a network of one's own from scene
-            and model, see `network.methods.method.Method`; else the scene's.
+        terms: of one's own, beside the scene's, see `energies.terms.OwnTerm`. network: a function of one's own,
+            (scene, model) -> network, see `network.methods.method.Method`; else the scene's.
         dtype: of everything; float64 needs JAX's x64 mode. report: called with what is done next, in words; without one, what
             takes long is told on stderr in a terminal or a notebook, and nothing elsewhere. ahead: called before that with
             what is expected, zeros in the place of the vibrations, so that programs can be compiled meanwhile.
@@ -217,21 +217,18 @@ def assemble(
     What takes long are the vibrations of `network.cell = "swing"`. Energies need none: with "gated" none are looked for.
 
     Raises:
-        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+        InputError: a file is unusable, joint counts disagree, units are off, the garment is not on the body, or a term or the
+            network does not fit.
     """
     if network is not None and scene.network.cell == "auto":  # one's own needs no vibrations, unless the scene asks for them
         scene = replace(scene, network=replace(scene.network, cell="gated"))
-
-    def with_own(assembly: Assembly) -> Assembly:
-        if terms:
-            assembly = replace(assembly, model=assembly.model.with_terms(terms))
-        return assembly if network is None else replace(assembly, network=network(scene, assembly.model))
-
-    def expected(assembly: Assembly) -> None:
-        if ahead is not None and network is None:  # one's own may look at the vibrations
-            ahead(with_own(assembly))
-
-    return with_own(build(scene, prepared=prepared, below=worn_below(scene), dtype=dtype, report=report, ahead=expected))
+    ahead = ahead if network is None else None  # one's own may look at the vibrations
+    assembly = build(scene, prepared=prepared, below=worn_below(scene), terms=terms, dtype=dtype, report=report, ahead=ahead)
+    if network is None:
+        return assembly
+    made = network(scene, assembly.model)
+    check_network(made, assembly.model)
+    return replace(assembly, network=made)
 
 
 def worn_below(scene: Scene) -> list[Below]:

@@ -21,7 +21,7 @@ from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.skinning import skin
 from ncs_jax.io.tables.npz import read_npz, write_npz
-from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.build import Assembly, features_from_records, tell_a_person
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import Model
@@ -37,7 +37,7 @@ TURN = (0.3, 0.5, 0.7)
 
 @dataclass(frozen=True)
 class Progress:
-    """What a simulation says after every frame, and as it `begins`, before it compiles."""
+    """What a simulation says after every frame, and once before the first, as it is `compiling`."""
 
     frame: int
     frames: int
@@ -45,7 +45,7 @@ class Progress:
     residual: float  # g
     status: int
     left: float  # s
-    begins: bool = False
+    compiling: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,8 @@ def simulate(
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
             first. partial: a file that keeps what is done while it runs and is continued from where it exists. report: called
-            before the first and after every frame. terms: of one's own, see `energies.terms.OwnTerm`.
+            before the first frame, which compiles for a minute or more, and after every one; without it a line in a terminal
+            or a notebook says so. terms: of one's own, see `energies.terms.OwnTerm`.
 
     Raises:
         InputError: the scene or the motion is unusable, or the partial file belongs to another simulation.
@@ -163,8 +164,11 @@ def _simulated(
     rows: dict[str, list] = {key: list(values) for key, values in done.items()}
     begun = saved = time.monotonic()
     first = len(rows["status"])
-    if report is not None and first < frames:
-        report(Progress(first, frames, 0, 0.0, 0, 0.0, begins=True))
+    if first < frames:
+        if report is None:
+            tell_a_person(f"compiling, which may take a minute or more, then frame {first + 1} of {frames}")
+        else:
+            report(Progress(first, frames, 0, 0.0, 0, 0.0, compiling=True))
     for t in range(first, frames):
         solutions: list[Solution] = []
         started = time.monotonic()

@@ -59,8 +59,10 @@ def train(
         resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned; its scene and seed stand.
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
         report: called after every chunk of steps; KeyboardInterrupt from it ends the run with a checkpoint of these steps.
-        say: called with what is done next, in words, before the first step. terms: of one's own, see `energies.terms.OwnTerm`.
-        network: makes one's own from scene and model, see `network.methods.method.Method`.
+        say: called with what is done next, in words, before the first step.
+        terms: of one's own, see `ncs_jax.energies.terms.OwnTerm`: pure functions `term(x, step)` of positions (m) and step
+            inputs, in J.
+        network: a function of one's own, (scene, model) -> network, see `ncs_jax.network.methods.method.Method`.
 
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 

@@ -18,7 +18,7 @@ __all__ = ["MotionFeatures", "input_joints", "mirror", "motion_features"]
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MotionFeatures:
     """Motions laid end to end. `start` is the first frame of the motion that a frame belongs to.
 
@@ -34,6 +34,16 @@ class MotionFeatures:
     bodies: Float[Array, "frames body 6"] | None = None  # positions in m and normals of the touchable body
     origin: Float[Array, "frames 3"] | None = None  # m
     swing: Float[Array, "frames modes"] | None = None  # of the garment, see `methods.swing`
+
+    def __repr__(self) -> str:
+        """Return in a line how many frames, joints and motions there are, and which frames are of which motion."""
+        start = self.start
+        if isinstance(start, jax.core.Tracer) or not isinstance(start, jax.Array | np.ndarray) or start.ndim != 1:
+            return f"MotionFeatures(start={start})"
+        first = np.unique(start)
+        spans = [f"{a} to {b - 1}" for a, b in zip(first, [*first[1:], len(start)], strict=True)]
+        shown = ", ".join(spans if len(spans) <= 6 else [*spans[:5], "...", spans[-1]])
+        return f"MotionFeatures({len(start)} frames, {self.matrices.shape[-3]} joints, {len(spans)} motions: frames {shown})"
 
     def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
         """Return positions measured from the track's origin, in the world, m."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["Animation", "PosedBody", "upright"]
+__all__ = ["Animation", "PosedBody", "upright", "upright_axes"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +19,8 @@ class PosedBody:
     Attributes:
         vertices: (frames, body, 3), m. faces: (faces, 3).
         worn: how many of the vertices, the last, are of garments worn below, whose faces come last too.
+        axes: (frames, 3, 3) of the trunk, see `heading.trunk_axes`: a picture is taken from the front by them. None: by how the
+            outline has turned since the first frame.
 
     Raises:
         InputError: the shapes do not fit together.
@@ -27,6 +29,7 @@ class PosedBody:
     vertices: np.ndarray
     faces: np.ndarray
     worn: int = 0
+    axes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check what was given."""
@@ -37,6 +40,20 @@ class PosedBody:
                 f"0 to {self.vertices.shape[1]} vertices of the body expected", field="worn", value=self.worn,
                 mend="count the last vertices, those of the garments worn below",
             )  # fmt: skip
+        if self.axes is not None and self.axes.shape != (expected := (len(self.vertices), 3, 3)):
+            raise InputError(
+                f"a matrix for each frame expected, {expected}", field="axes", value=self.axes.shape,
+                mend="leave it out, or take `heading.trunk_axes`",
+            )  # fmt: skip
+
+    def turned(self, up: Sequence[float]) -> PosedBody:
+        """Return this body turned so that `up` becomes +Y."""
+        axes = None if self.axes is None else upright_axes(self.axes, up)
+        return replace(self, vertices=upright(self.vertices, up), axes=axes)
+
+    def at(self, frames: slice) -> PosedBody:
+        """Return some of the frames."""
+        return replace(self, vertices=self.vertices[frames], axes=None if self.axes is None else self.axes[frames])
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +93,19 @@ class Animation:
 
     def y_up(self) -> Animation:
         """Return this animation turned so that +Y is up."""
-        body = None if self.body is None else replace(self.body, vertices=upright(self.body.vertices, self.up))
+        body = None if self.body is None else self.body.turned(self.up)
         return replace(self, garment=upright(self.garment, self.up), body=body, up=(0.0, 1.0, 0.0))
 
     def until(self, end: int | None) -> Animation:
         """Return the frames before `end`, all for None."""
-        body = None if self.body is None else replace(self.body, vertices=self.body.vertices[:end])
-        return replace(self, garment=self.garment[:end], body=body)
+        return self._at(slice(end))
 
     def every(self, step: int) -> Animation:
         """Return every `step`-th frame, from the first on, as fast as before."""
-        body = None if self.body is None else replace(self.body, vertices=self.body.vertices[::step])
-        return replace(self, garment=self.garment[::step], body=body, fps=self.fps / step)
+        return replace(self._at(slice(None, None, step)), fps=self.fps / step)
+
+    def _at(self, frames: slice) -> Animation:
+        return replace(self, garment=self.garment[frames], body=None if self.body is None else self.body.at(frames))
 
 
 def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.ndarray:
@@ -102,6 +120,11 @@ def upright(vertices: np.ndarray, up: Sequence[float] = (0.0, 1.0, 0.0)) -> np.n
         k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
         turn = np.eye(3) + k + k @ k / (1 + u[1])
     return (np.asarray(vertices) @ turn.T).astype(np.asarray(vertices).dtype)
+
+
+def upright_axes(axes: np.ndarray, up: Sequence[float]) -> np.ndarray:
+    """Turn matrices (..., 3, 3) whose columns are directions, as `upright` turns vertices."""
+    return np.swapaxes(upright(np.swapaxes(axes, -1, -2), up), -1, -2)
 
 
 def _unit(up: Sequence[float]) -> np.ndarray:

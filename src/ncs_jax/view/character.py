@@ -23,7 +23,9 @@ from ncs_jax.geometry.skinning import (
 )
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.posing import world_axes, world_turns
 from ncs_jax.view.animation import Animation, PosedBody
+from ncs_jax.view.heading import trunk_axes, up_of
 
 __all__ = ["animation_of", "body_vertices", "posed_body"]
 
@@ -40,7 +42,8 @@ def animation_of(assembly: Assembly, motion: io.MotionRecord, vertices: np.ndarr
     Raises:
         InputError: the vertices do not fit: see `Animation`.
     """
-    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, motion))
+    up = up_of(assembly.scene.physics.gravity)
+    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, motion), up)
 
 
 def posed_body(assembly: Assembly, motion: io.MotionRecord) -> PosedBody | None:
@@ -52,7 +55,8 @@ def posed_body(assembly: Assembly, motion: io.MotionRecord) -> PosedBody | None:
         faces.append(np.asarray(layer.model.garment.mesh.faces) + sum(v.shape[1] for v in vertices))
         vertices.append(animated(layer.model, layer.network, layer.params, features_from_records(layer.model, motion)))
     worn = sum(v.shape[1] for v in vertices[1:])
-    return PosedBody(np.concatenate(vertices, axis=1), np.concatenate(faces), worn)
+    turns = world_turns(world_axes(motion.poses, assembly.body.rest_rotations), assembly.body.parents)
+    return PosedBody(np.concatenate(vertices, axis=1), np.concatenate(faces), worn, trunk_axes(assembly.body, turns))
 
 
 def body_vertices(body: io.BodyRecord, motion: io.MotionRecord) -> np.ndarray:

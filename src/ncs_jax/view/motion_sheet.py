@@ -21,9 +21,10 @@ from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import side_and_rest
 from ncs_jax.prepare.posing import carried, joint_transforms, skinned
 from ncs_jax.prepare.setting import Setting
-from ncs_jax.view.animation import upright
+from ncs_jax.view.animation import upright, upright_axes
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
+from ncs_jax.view.heading import heading, trunk_axes, up_of
 from ncs_jax.view.pictures import BODY, CLOTH, CLOTH_INSIDE, FAINT, INK, WORN
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
@@ -63,8 +64,7 @@ def motion_sheet(path: str | Path, setting: Setting, motions: Mapping[str, Motio
 def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Image:
     """Return one motion: its title, the character and the skeleton in some frames, and their times."""
     body = required(setting.body, "body.file", "name a body")
-    gravity = np.array(setting.scene.physics.gravity)
-    up = tuple((-gravity).tolist()) if np.any(gravity) else (0.0, 1.0, 0.0)
+    up = up_of(setting.scene.physics.gravity)
     frames = shown_frames(len(record.poses))
     matrices = posed(body, record, frames)
     joints = np.einsum("njab,jb->nja", matrices[..., :3], body.joints) + matrices[..., 3]
@@ -77,7 +77,8 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
     low, high = min(floor, float(skin[..., 1].min())), max(float(skin[..., 1].max()), floor + 0.5)
     (width, height), columns = TILE, len(frames)
     image = Image.new("RGB", (2 * MARGIN + width * 8, TITLE + 2 * height + 22), PAPER)
-    tall, azimuths = 1.15 * (high - low), [TURNED + _heading(rest, x) for x in skin]
+    axes = upright_axes(trunk_axes(body, matrices[..., :3]), up)
+    tall, azimuths = 1.15 * (high - low), [TURNED + heading(each) for each in axes]
     wide = 1.1 * max(
         float(np.ptp(x @ (math.cos(a), 0.0, -math.sin(a)))) for x, a in zip(skin, np.radians(azimuths), strict=True)
     )
@@ -133,9 +134,3 @@ def _stick_figure(places: np.ndarray, source: SkeletonPoses, camera: Camera, flo
             r = 1.3 * FINE
             draw.ellipse([x[j] - r, y[j] - r, x[j] + r, y[j] + r], SIDES[sides[j]])
     return image.resize(TILE, Image.Resampling.LANCZOS)
-
-
-def _heading(rest: np.ndarray, now: np.ndarray) -> float:
-    """Return how far points have turned about Y since rest, degrees: the best fit in x and z."""
-    (x0, _, z0), (x1, _, z1) = (rest - rest.mean(0)).T, (now - now.mean(0)).T
-    return math.degrees(math.atan2((x1 * z0 - z1 * x0).sum(), (x1 * x0 + z1 * z0).sum()))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
+from ncs_jax.view.heading import heading
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 __all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet"]
@@ -58,8 +59,10 @@ class _Stage:
         return Ground(self.floor, (self.path[frame, 0], self.path[frame, 2]), radius)
 
     def heading(self, frame: int) -> float:
-        """Return how far the character has turned about Y since the first frame, degrees: the best fit in x and z."""
+        """Return how far the character is turned about Y, degrees: by its trunk, else since the first frame, by its outline."""
         body = self.animation.body
+        if body is not None and body.axes is not None:
+            return heading(body.axes[frame])
         x = self.animation.garment if body is None else body.vertices
         first, now = x[0], x[frame]
         good = _drawable(first).all(1) & _drawable(now).all(1)
@@ -135,42 +138,64 @@ def _font(size):
 
 
 def contact_sheet(
-    path: str | Path, animation: Animation, *, frames: int = 8, tile: int = 520, labels: Sequence[str] = ()
+    path: str | Path,
+    animation: Animation | Mapping[str, Animation],
+    *,
+    frames: int = 8,
+    tile: int = 520,
+    labels: Sequence[str] = (),
 ) -> None:
     """Write a PNG of several moments of an animation, from the character's front and side; the camera turns with it.
 
+        contact_sheet("both.png", {"network": one, "simulation": other})
+
     Args:
-        path: of the PNG. animation: to draw. frames: how many moments, evenly spread. tile: height of one picture in pixels.
-        labels: of the moments; without them the time of each.
+        path: of the PNG. animation: to draw; or several by their names, each in a row, from the front. frames: how many
+            moments, evenly spread. tile: height of one picture in pixels. labels: of the moments; without them the time of
+            each.
+
+    Raises:
+        InputError: animations have other frames, or there is not a label for each moment.
     """
-    stage = _stage(animation)
-    chosen = np.unique(np.linspace(0, stage.frames - 1, max(1, frames)).round().astype(int)).tolist()
+    if isinstance(animation, Animation):
+        stage = _stage(animation)
+        rows = [(view, view, stage) for view in _ROWS]
+    else:
+        rows = [(name, "front", _stage(each)) for name, each in animation.items()]
+    counts = {stage.frames for *_, stage in rows}
+    if len(counts) != 1:
+        raise InputError("animations of as many frames expected", field="animation", value=sorted(counts))
+    chosen = np.unique(np.linspace(0, counts.pop() - 1, max(1, frames)).round().astype(int)).tolist()
     if labels and len(labels) != len(chosen):
         raise InputError(f"a label for each of {len(chosen)} moments expected", field="labels", value=len(labels))
-    headings = [stage.heading(frame) for frame in chosen]
-    bounds = [[stage.bounds(frame, turn + VIEWS[view]) for frame, turn in zip(chosen, headings, strict=True)] for view in _ROWS]
+    turned = [[stage.heading(frame) + VIEWS[view] for frame in chosen] for _, view, stage in rows]
+    bounds = [
+        [stage.bounds(frame, azimuth) for frame, azimuth in zip(chosen, azimuths, strict=True)]
+        for (*_, stage), azimuths in zip(rows, turned, strict=True)
+    ]
     low, high = min(each[1] for row in bounds for each in row), max(each[2] for row in bounds for each in row)
     tall = 1.10 * (high - low)
     wide = 1.10 * max(each[3] for row in bounds for each in row)
     width = round(tile * min(max(wide / tall, 0.40), 1.3))
     margin, label = 56, 40
-    sheet = Image.new("RGB", (2 * margin + width * len(chosen), 2 * tile + 2 * label + margin), PAPER)
+    sheet = Image.new("RGB", (2 * margin + width * len(chosen), len(rows) * tile + 2 * label + margin), PAPER)
     draw = ImageDraw.Draw(sheet)
-    for row, view in enumerate(_ROWS):
+    for row, (name, _, stage) in enumerate(rows):
         top = label + row * tile
-        for column, (frame, turn, (middle, *_)) in enumerate(zip(chosen, headings, bounds[row], strict=True)):
+        for column, (frame, azimuth, (middle, *_)) in enumerate(zip(chosen, turned[row], bounds[row], strict=True)):
             target = (middle[0], (low + high) / 2, middle[1])
-            camera = Camera(target, tall, wide, turn + VIEWS[view], elevation=7.0)
+            camera = Camera(target, tall, wide, azimuth, elevation=7.0)
             ground = Ground(stage.floor, middle, max(0.75, 0.55 * tall * width / tile), cell=0)
             picture = render(stage.meshes(frame), camera, (width, tile), ground=ground)
             sheet.paste(Image.fromarray(picture), (margin + column * width, top))
         text = Image.new("L", (tile, label), 0)
-        ImageDraw.Draw(text).text((tile / 2, label / 2), view.upper(), 255, _font(17), "mm")
+        ImageDraw.Draw(text).text((tile / 2, label / 2), name.upper(), 255, _font(17), "mm")
         sheet.paste(FAINT, (8, top), text.rotate(90, expand=True))
+    fps = rows[0][2].animation.fps
     for column, frame in enumerate(chosen):
         x = margin + (column + 0.5) * width
-        below = labels[column] if labels else f"{frame / animation.fps:.2f} s"
-        draw.text((x, label + 2 * tile + 22), below, INK, _font(22), "mm")
+        below = labels[column] if labels else f"{frame / fps:.2f} s"
+        draw.text((x, label + len(rows) * tile + 22), below, INK, _font(22), "mm")
     sheet.save(path, optimize=True)
 
 

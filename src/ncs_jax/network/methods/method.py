@@ -26,11 +26,13 @@ __all__ = [
     "Method",
     "Offsets",
     "Windows",
+    "check_network",
     "decode",
     "descriptor_sizes",
     "for_inference",
     "garment_blend",
     "initial_parameters",
+    "static_code_size",
 ]
 
 
@@ -109,10 +111,6 @@ class Method(Protocol):
         """Return whether the skinning weights are trained too."""
 
     @property
-    def code(self) -> int:
-        """Return how many numbers a code has."""
-
-    @property
     def state(self) -> int:
         """Return how many numbers are carried from frame to frame."""
 
@@ -123,6 +121,9 @@ class Method(Protocol):
     @property
     def refreshes(self) -> bool:
         """Return whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
+
+    def code_size(self, model: Model) -> int:
+        """Return how many numbers a code has."""
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Return fresh parameters of all but the decoder."""
@@ -157,10 +158,53 @@ def descriptor_sizes(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
     return (joints, numbers + 3), (joints, numbers + 6)
 
 
+def static_code_size(encoder: nn.Module, model: Model) -> int:
+    """Return how many numbers a static encoder makes of a frame's descriptors; nothing is computed.
+
+    Raises:
+        InputError: it does not make (*frames, code) of (*frames, joints, numbers).
+    """
+    given = jax.ShapeDtypeStruct((2, 3, *descriptor_sizes(model)[0]), model.basis.dtype)
+    code = jax.eval_shape(lambda x: encoder.init_with_output(jax.random.PRNGKey(0), x)[0], given)
+    shape = getattr(code, "shape", None)
+    if shape is None or shape[:-1] != (2, 3):
+        what = f"codes (*frames, code) of descriptors (*frames, joints, numbers) expected, here (2, 3, code) of {given.shape}"
+        raise InputError(what, field="static encoder", value=f"shape {shape}", mend="leave the leading axes as they are")
+    return shape[-1]
+
+
+def check_network(network: Any, model: Model) -> None:
+    """Trace one frame of a network of one's own: what does not fit is found before anything is compiled.
+
+    Raises:
+        InputError: a part lacks what the method reads, or gives another shape than expected.
+    """
+    key, (static, dynamic) = jax.random.PRNGKey(0), descriptor_sizes(model)
+
+    def frame(static, dynamic, matrices):
+        params = initial_parameters(network, key, model)
+        state = jnp.zeros((2, network.state), model.basis.dtype)
+        _, codes = network.step(params, model, state, static, dynamic if network.state else None, matrices)
+        if codes.dynamic is not None and codes.dynamic.shape != codes.static.shape:
+            what, found = (
+                f"codes as long as the static encoder's, {codes.static.shape[-1]} numbers, expected",
+                codes.dynamic.shape,
+            )
+            raise InputError(what, field="dynamic encoder", value=f"shape {found}", mend="z = z_S + alpha z_D adds them")
+        return decode(network, params, model, codes.together())
+
+    shapes = (2, *static), (2, *dynamic), (2, len(model.skeleton.parents), 3, 4)
+    try:
+        jax.eval_shape(frame, *(jax.ShapeDtypeStruct(shape, model.basis.dtype) for shape in shapes))
+    except AttributeError as fault:
+        mend = "see ncs_jax.network.methods.method.Method, and notebooks/own_network.ipynb for encoders"
+        raise InputError(f"what the method reads is missing: {fault}", field="network", mend=mend) from fault
+
+
 def initial_parameters(network: Method, key: Array, model: Model) -> dict:
     """Return fresh parameters: a plain pytree of arrays."""
     first, second, third = jax.random.split(key, 3)
-    code = jnp.zeros(network.code, model.basis.dtype)
+    code = jnp.zeros(network.code_size(model), model.basis.dtype)
     params = network.init((first, second), model)
     params["decoder"] = network.decoder.init(third, code, model.basis)["params"]
     if network.learn_weights:

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder, StaticEncoder
-from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes
+from ncs_jax.network.encoders import DynamicEncoder, LinearEncoder
+from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes, static_code_size
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -25,15 +25,10 @@ class NCS(FromCodes):
     Source: Bertiche, Madadi, Escalera 2022.
     """
 
-    static: StaticEncoder
+    static: nn.Module
     dynamic: DynamicEncoder | None
     decoder: nn.Module
     learn_weights: bool = False
-
-    @property
-    def code(self) -> int:
-        """Return how many numbers a code has."""
-        return self.static.sizes[-1]
 
     @property
     def state(self) -> int:
@@ -44,6 +39,10 @@ class NCS(FromCodes):
     def controlled(self) -> bool:
         """Return whether alpha scales anything."""
         return self.dynamic is not None
+
+    def code_size(self, model: Model) -> int:
+        """Return how many numbers a code has: the static encoder's."""
+        return static_code_size(self.static, model)
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Return fresh parameters of both encoders."""

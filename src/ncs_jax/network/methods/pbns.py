@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.network.encoders import StaticEncoder
-from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes
+from ncs_jax.network.methods.method import Codes, FromCodes, descriptor_sizes, static_code_size
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
@@ -24,16 +23,15 @@ class PBNS(FromCodes):
     Source: Bertiche, Madadi, Escalera 2021, with the descriptors, sizes and decoder of the other methods here.
     """
 
-    static: StaticEncoder
+    static: nn.Module
     decoder: nn.Module
     learn_weights: bool = False
     state = 0
     controlled = False
 
-    @property
-    def code(self) -> int:
-        """Return how many numbers a code has."""
-        return self.static.sizes[-1]
+    def code_size(self, model: Model) -> int:
+        """Return how many numbers a code has: the static encoder's."""
+        return static_code_size(self.static, model)
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Return fresh parameters of the encoder."""

@@ -31,13 +31,12 @@ class SNUG(FromCodes):
     controlled = False
 
     @property
-    def code(self) -> int:
-        """Return how many numbers a code has."""
-        return self.recurrent.state
-
-    @property
     def state(self) -> int:
         """Return how many numbers are carried from frame to frame: the code's."""
+        return self.recurrent.state
+
+    def code_size(self, model: Model) -> int:
+        """Return how many numbers a code has: the state's."""
         return self.recurrent.state
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:

@@ -30,8 +30,17 @@ from jaxtyping import Array, Float, Int
 from ncs_jax.energies.terms import Terms
 from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import blend
-from ncs_jax.network.encoders import StaticEncoder, SwingEncoder
-from ncs_jax.network.methods.method import Codes, Kept, Offsets, Windows, decode, descriptor_sizes, garment_blend
+from ncs_jax.network.encoders import SwingEncoder
+from ncs_jax.network.methods.method import (
+    Codes,
+    Kept,
+    Offsets,
+    Windows,
+    decode,
+    descriptor_sizes,
+    garment_blend,
+    static_code_size,
+)
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes, pose_garment
 
@@ -52,7 +61,7 @@ class Swing:
     with modal dynamics (Pentland and Williams 1989) in place of a recurrent network.
     """
 
-    static: StaticEncoder
+    static: nn.Module
     dynamic: SwingEncoder
     decoder: nn.Module
     verts: int
@@ -63,11 +72,6 @@ class Swing:
     refreshes = True
 
     @property
-    def code(self) -> int:
-        """Return how many numbers a code has."""
-        return self.static.sizes[-1]
-
-    @property
     def state(self) -> int:
         """Return how many numbers are carried.
 
@@ -75,6 +79,10 @@ class Swing:
         frame.
         """
         return 6 * self.verts + 3 + self.modes + 1
+
+    def code_size(self, model: Model) -> int:
+        """Return how many numbers a code has: the static encoder's."""
+        return static_code_size(self.static, model)
 
     def init(self, keys: tuple[Array, Array], model: Model) -> dict:
         """Return fresh parameters of both encoders."""
@@ -96,7 +104,7 @@ class Swing:
         state, matrices = state.reshape(-1, self.state).T, jnp.moveaxis(matrices.reshape(-1, *matrices.shape[-3:]), 0, -1)
         earlier, root, q, started = jnp.split(state, np.cumsum([6 * self.verts, 3, self.modes]))
         now = matrices[0, :, 3]
-        s, p = self._static_garment(params, model, fixed.reshape(-1, self.code), matrices.at[:, :, 3].add(-now[None]))
+        s, p = self._static_garment(params, model, fixed.reshape(-1, fixed.shape[-1]), matrices.at[:, :, 3].add(-now[None]))
         previous, before = jnp.where(started[None, None] > 0, earlier.reshape(2, *s.shape) + (root - now)[None, None], s[None])
         g, push = _product(model, p, p), _push(model, p, s - 2 * previous + before)
         h = 1 / model.fps

@@ -116,6 +116,38 @@ def relax_patch(problem: Problem, x: Float[Array, "verts 3"], neighbours, left: 
     return x, neighbours, count
 
 
+def _settled(problem: Problem, judged, x, known, stale):
+    """Evaluate where what is known is stale, and find what is near anew before it can no longer be trusted.
+
+    That is in any case before the frame is done. The program has the evaluation once.
+
+    Args:
+        judged: returns status and what is left. known: point, neighbours, status, what is left. stale: whether x is another
+            place than the point's; None: it never is.
+    """
+
+    def far(neighbours, status):
+        if neighbours is None:
+            return jnp.asarray(False)
+        done = (status == CONVERGED) | (status == STALLED)
+        return max_displacement(x, neighbours.found_at) > jnp.where(done, 0, trust_radius(problem, x) / 2)
+
+    def unsettled(state):
+        _, neighbours, status, _, stale = state
+        return far(neighbours, status) if stale is None else stale | far(neighbours, status)
+
+    def again(state):
+        _, neighbours, _, _, stale = state
+        if stale is None:
+            neighbours = find_neighbours(problem, x)
+        elif neighbours is not None:
+            neighbours = lax.cond(stale, lambda: neighbours, lambda: find_neighbours(problem, x))
+        point = evaluate(with_neighbours(problem, neighbours), x)
+        return point, neighbours, *judged(point, False, x), None if stale is None else jnp.asarray(False)
+
+    return lax.while_loop(unsettled, again, (*known, stale))[:4]
+
+
 def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"]) -> tuple[Float[Array, "verts 3"], Solution]:
     """Return positions that minimise the energy, found from `start`, and how the solve went."""
     direction = DIRECTIONS[settings.solver]
@@ -135,31 +167,17 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
         status, left = judged(point, ~moved, p)
         if direction.patches and x.shape[0] > 4 * SIZE:
 
-            def relax(x, point, neighbours):
+            def relax(x, neighbours):
                 enough = mass * (tolerance * G) ** 2
                 x, neighbours, count = relax_patch(problem, x, neighbours, imbalance(point.gradient, problem.mass), enough)
-                point = lax.cond(count > 0, lambda: evaluate(with_neighbours(problem, neighbours), x), lambda: point)
-                return x, point, neighbours, *judged(point, False, x)
+                return x, neighbours, count > 0
 
-            x, point, neighbours, status, left = lax.cond(
-                status < 0, relax, lambda *same: (*same, status, left), x, point, neighbours
-            )
-        point, neighbours, status, left = again_if_far(x, point, neighbours, status, left)
+            x, neighbours, stale = lax.cond(status < 0, relax, lambda *same: (*same, jnp.asarray(False)), x, neighbours)
+        else:
+            stale = None
+        if neighbours is not None or stale is not None:
+            point, neighbours, status, left = _settled(problem, judged, x, (point, neighbours, status, left), stale)
         return x, point, memory, neighbours, status, left, iteration + 1
-
-    def again_if_far(x, point, neighbours, status, left):
-        """Find what is near anew before it can no longer be trusted, and in any case before the frame is done."""
-        if neighbours is None:
-            return point, neighbours, status, left
-
-        def again():
-            neighbours = find_neighbours(problem, x)
-            point = evaluate(with_neighbours(problem, neighbours), x)
-            return point, neighbours, *judged(point, False, x)
-
-        done = (status == CONVERGED) | (status == STALLED)
-        far = jnp.where(done, 0, trust_radius(problem, x) / 2)
-        return lax.cond(max_displacement(x, neighbours.found_at) > far, again, lambda: (point, neighbours, status, left))
 
     def judged(point, stuck, p):
         left = out_of_balance(point.gradient, problem.mass)
@@ -170,7 +188,7 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     neighbours = refresh_neighbours(problem, start, problem.neighbours)
     point = evaluate(with_neighbours(problem, neighbours), start)
     status, left = judged(point, False, start)
-    if neighbours is not None:  # as `again_if_far` would, but without a program of its own: one step is taken in any case
+    if neighbours is not None:  # as `_settled` would, but without a program of its own: one step is taken in any case
         status = jnp.where((status == CONVERGED) & (max_displacement(start, neighbours.found_at) > 0), -1, status)
     memory = direction.begin(with_neighbours(problem, neighbours), start, point)
     state = (start, point, memory, neighbours, status, left, jnp.zeros((), jnp.int32))

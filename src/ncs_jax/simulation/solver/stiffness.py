@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.bending import hinge_weight
@@ -61,7 +62,7 @@ def couplings_from(mesh: Mesh) -> Couplings:
 
 
 def _membrane(x, mesh: Mesh, density, numbers):
-    """Blocks (3 corners, 3 corners, faces, 3, 3) of the faces' Hessians, each made positive semi-definite.
+    """Blocks (6, faces, 3, 3) of the faces' Hessians, each made positive semi-definite: of the corners, then of `FACE`.
 
     A density depends on lengths and angles only, so seen in the face's own frame (t, s, n) its Hessian has two parts: that of
     the material within the plane, 4x4, and the stress, 2x2, which acts alike on all three axes. Each loses its negative part.
@@ -72,13 +73,11 @@ def _membrane(x, mesh: Mesh, density, numbers):
     flat = jnp.stack([jnp.sum(w * t[None], axis=-1), jnp.sum(w * s[None], axis=-1), zero], axis=1)
     _, along = jax.linearize(jax.grad(lambda w: jnp.sum(density([[*w[0]], [*w[1]]], *numbers))), flat)
 
-    def column(i, a):
-        return along(jnp.zeros_like(flat).at[i, a].set(1))
-
-    out = [column(j, 2) for j in range(2)]
-    stress = jnp.stack([jnp.stack([out[j][i, 2] for j in range(2)]) for i in range(2)])
-    inner = jnp.stack([column(j, b)[:, a] for j in range(2) for b in range(2) for a in range(2)])
-    inner = inner.reshape(2, 2, 2, 2, -1).transpose(3, 2, 0, 1, 4)  # (i, a, j, b, faces)
+    # Every column is one row of a batch: the program has the derivative once. (j, b, i, a, faces)
+    unit = jnp.eye(6, dtype=x.dtype).reshape(6, 2, 3, 1)
+    columns = jax.vmap(along)(jnp.broadcast_to(unit, (6, *flat.shape))).reshape(2, 3, *flat.shape)
+    stress = columns[:, 2, :, 2].swapaxes(0, 1)
+    inner = columns[:, :2, :, :2].transpose(2, 3, 0, 1, 4)  # (i, a, j, b, faces)
     inner = inner - stress[:, None, :, None] * jnp.eye(2, dtype=x.dtype)[None, :, None, :, None]
     material = positive_part(inner.reshape(4, 4, -1)).reshape(2, 2, 2, 2, -1)
     pull = positive_part(stress)
@@ -86,18 +85,15 @@ def _membrane(x, mesh: Mesh, density, numbers):
     axes = jnp.stack([t, s])
     eye = jnp.eye(3, dtype=x.dtype)
     shape = jnp.stack([-mesh.face_axes[:, 0] - mesh.face_axes[:, 1], mesh.face_axes[:, 0], mesh.face_axes[:, 1]])
-    blocks = {}
-    for k in range(3):
-        for other in range(3):
-            # w_i = sum_k shape_ki x_k
-            weight = {(i, j): area * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
-            even = sum((weight[i, j] * pull[i, j] for i, j in weight), start=jnp.zeros_like(area))
-            block = even[:, None, None] * eye[None]
-            for a in range(2):
-                for b in range(2):
-                    within = sum((weight[i, j] * material[i, a, j, b] for i, j in weight), start=jnp.zeros_like(area))
-                    block = block + within[:, None, None] * axes[a, :, :, None] * axes[b, :, None, :]
-            blocks[k, other] = block
+    k, other = np.array([(corner, corner) for corner in range(3)] + [*FACE]).T
+    # w_i = sum_k shape_ki x_k
+    weight = {(i, j): area[None] * shape[k, :, i] * shape[other, :, j] for i in range(2) for j in range(2)}
+    even = sum((weight[i, j] * pull[i, j][None] for i, j in weight), start=jnp.zeros_like(weight[0, 0]))
+    blocks = even[..., None, None] * eye[None, None]
+    for a in range(2):
+        for b in range(2):
+            within = sum((weight[i, j] * material[i, a, j, b][None] for i, j in weight), start=jnp.zeros_like(even))
+            blocks = blocks + within[..., None, None] * (axes[a, :, :, None] * axes[b, :, None, :])[None]
     return blocks
 
 
@@ -152,10 +148,8 @@ def _own(x, step: StepInputs, terms: Terms):
     """
     gradient = jax.grad(lambda x: sum((term(x, step) for term in terms.own), start=jnp.zeros((), x.dtype)))
 
-    def column(axis):
-        return jax.jvp(gradient, (x,), (jnp.zeros_like(x).at[:, axis].set(1),))[1]
-
-    block = jnp.stack([column(axis) for axis in range(3)])  # (columns, verts, rows)
+    axes = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None], (3, *x.shape))
+    block = lax.map(lambda way: jax.jvp(gradient, (x,), (way,))[1], axes)  # (columns, verts, rows), one after the other
     return jnp.transpose(positive_part((block + jnp.swapaxes(block, 0, 2)).transpose(0, 2, 1) / 2), (2, 0, 1))
 
 
@@ -188,8 +182,8 @@ def stiffness(
         off = off.at[couplings.edge_pairs].add(-block)
     elif terms.membrane is not None:
         blocks = _membrane(x, mesh, DENSITIES[terms.membrane], material.membrane)
-        diagonal = diagonal.at[mesh.faces.T].add(jnp.stack([blocks[k, k] for k in range(3)]))
-        parts = jnp.stack([turned(blocks[k], couplings.face_flips[i]) for i, k in enumerate(FACE)])
+        diagonal = diagonal.at[mesh.faces.T].add(blocks[:3])
+        parts = jnp.stack([turned(block, flip) for block, flip in zip(blocks[3:], couplings.face_flips, strict=True)])
         off = off.at[couplings.face_pairs].add(parts)
     if terms.bending:
         gradient, weight = _bending(x, mesh, material.bending)
