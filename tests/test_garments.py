@@ -363,6 +363,35 @@ def test_a_garment_that_nothing_brings_onto_the_body():
         check_on_body(Path("g.npz"), garment(grid()[0] * 1e5), body, axis_given=False)
 
 
+def turned_round(faces, which):
+    return np.where(which[:, None], faces[:, [0, 2, 1]], faces)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.45, 0.6, 1.0])
+def test_triangles_that_face_the_other_side_are_turned(tmp_path, rng, share):
+    """To where most look, or outward where about half do; what agrees stays, inward too; another component is left alone."""
+    x, faces = tube(20, 8, 0.2, 0.6)
+    wrong = rng.random(len(faces)) < share
+    both = np.concatenate([turned_round(faces, wrong), faces + len(x)])
+    np.savez(tmp_path / "g.npz", vertices=np.concatenate([x, x + [1, 0, 0]]), faces=both)
+    if share < 1:
+        with pytest.raises(InputError, match=r"facing the same side expected.*`ncs fit` turn them"):
+            io.read_garment(tmp_path / "g.npz")
+    read = io.read_garment(tmp_path / "g.npz", turn_faces=True)
+    np.testing.assert_array_equal(read.faces, np.concatenate([faces if share < 1 else both[: len(faces)], faces + len(x)]))
+    told = f"{wrong.sum()} of {len(both)} triangles faced the other side than their neighbours, the first is face "
+    assert [n.startswith(told + str(np.flatnonzero(wrong)[0])) for n in read.notes] == [True] * (share < 1)
+
+
+def test_a_surface_of_one_side_is_refused(tmp_path):
+    x, faces = tube(12, 2)
+    pairs = {0: 12, 12: 0}
+    cut = [[pairs.get(v, v) for v in f] if f in faces[-2:].tolist() else f for f in faces.tolist()]  # joined with a half turn
+    np.savez(tmp_path / "g.npz", vertices=x, faces=cut)
+    with pytest.raises(InputError, match=r"faces: a surface with two sides.*Moebius.*24 triangles.*the first is face 0.*cut"):
+        io.read_garment(tmp_path / "g.npz", turn_faces=True)
+
+
 def test_only_npz_is_written(tmp_path):
     with pytest.raises(InputError, match=r"shirt\.obj: a file name that ends in \.npz expected"):
         io.write_garment(tmp_path / "shirt.obj", garment(grid()[0]))

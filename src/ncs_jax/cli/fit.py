@@ -74,13 +74,16 @@ def fit(options) -> int:
         )
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
-    given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), source)
+    given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
+    given = with_body_weights(given, source)
     known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
     move = (0.0, 0.0, 0.0) if options.stay else options.move
     placement = place(options.garment, given, source, move=move, **known)
     print(
         f"{options.garment} on {options.source or options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles"
     )
+    for note in given.notes:
+        print(f"  note      {note}")
     _say_where(placement)
     picture = out.with_suffix(".png")
     if options.source:

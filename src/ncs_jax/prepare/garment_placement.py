@@ -13,7 +13,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.garment_checks import UNITS
-from ncs_jax.prepare.hanging import Trunk, opening_on, trunk_of, upper_opening
+from ncs_jax.prepare.hanging import CENTRED, SHAPED, Trunk, opening_on, trunk_of, upper_opening
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, pierced, skin_of, threaded
 
@@ -37,14 +37,10 @@ RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on,
 APART = 0.02  # of the height: what is nearer is no other place
 FLAT, AWAY = 1.15, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
 HELD = 0.15, 1.0  # but not upward, where it loses so much of its contact, and so much as far down: something carries it
-EASE = -0.002, 0.02  # of the height: the waist of what hangs is wider than the trunk on all sides by between these,
-SHAPED, CENTRED = 0.004, 0.006  # and so far, at most, are its shape from the trunk's and, if it stays, its middle from there
-USUAL, LIKE = 0.006, 0.25  # of the height: it is most often wider by this, and how much less that counts than its shape
-CLOSE = (
-    0.4  # of the misfit of cloth that is nowhere near the skin: a tube of less misfit fits closely, and its place is certain
-)
+CLOSE = 0.4  # of the misfit of cloth that is nowhere near: a tube of less misfit fits closely, and its place is certain
 SUNK = 0.1  # of its area may be inside the body: it is pushed out
 STAYED = "it hangs, and only its waist tells where: it stays at the height that the file has"
+ALSO = "it hangs around the trunk where the file has it, but its waist would be held as well {:.0f} cm {}; --stay keeps it here"
 HANGS = "it hangs, and the girth of its waist tells its height only to some centimetres"
 UPSIDE = 0.002, 0.0005  # of the height: what a place upside down, and one turned about the vertical, has less in its favour
 
@@ -150,8 +146,9 @@ def place(
             value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state its unit with --scale",
         )  # fmt: skip
     stays, hanging = (None, None) if move is not None else _hung(ways, raw, fine, skin, body)
-    if stays is not None:
+    if stays is not None and not stays.doubt:
         return stays
+    hanging = stays or hanging
     here = [replace(w, shift=np.zeros(3) if move is None else np.asarray(move, float)) for w in ways]
     exact = [skin.nearest(w.points(fine.points), fine.normals @ w.turned) for w in here]
     near = [float(_misfit(*e, skin, press=ROUGH[1])) for e in exact]  # even if somewhat inside
@@ -171,7 +168,7 @@ def place(
     chosen = _choose(ranked, fine, skin)
     if chosen.doubt:
         return hanging or chosen
-    return replace(chosen, doubt=HANGS) if _loose_tube(chosen, ranked, fine, skin) else chosen
+    return (stays or replace(chosen, doubt=HANGS)) if _loose_tube(chosen, ranked, fine, skin) else chosen
 
 
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
@@ -388,52 +385,54 @@ def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
 
 
 def _loose_tube(chosen: Placement, ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> bool:
-    """Tell whether a garment that was moved only hangs there: it lies closest some centimetres lower than where it was made."""
+    """Tell whether a garment only hangs there: it lies closest some centimetres lower than where it was made."""
     way = next(way for way, look in ranked if look.garment is chosen.garment)
     loops = [chosen.garment.vertices[loop] for loop in cloth.loops]
-    return bool(way.shift.any()) and way.cost > CLOSE * SKIN * skin.height and upper_opening(loops) is not None
+    return way.cost > CLOSE * SKIN * skin.height and upper_opening(loops) is not None
 
 
 def _hung(ways: list[_Way], raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRecord) -> tuple[Placement | None, ...]:
     """Return where a skirt or a strapless dress hangs, by its upper opening: where the file has it, and else.
 
-    The first is None where it does not hang there in one unit and upright axis alone: by chance none does. The second is None
-    where the opening does not tell the unit. It is in doubt, because girth and shape of a waist that is wider than the trunk
-    fit several centimetres higher and lower.
+    The first is None where it does not hang there in one unit and upright axis alone: by chance none does. It is in doubt where
+    the waist would be held as well higher or lower. The second is None where the opening does not tell the unit. It is in
+    doubt, because girth and shape of a waist that is wider than the trunk fit several centimetres higher and lower.
     """
     here, other, trunk = [], [], trunk_of(body)
     for way in ways:
         opening = upper_opening([way.points(raw.vertices[loop]) for loop in cloth.loops])
         if opening is not None:
-            stays, moved = _waists(way, opening, trunk, skin)
-            here += [way] * (stays and not way.turn)
+            farther, moved = _waists(way, opening, trunk, skin)
+            here += [] if farther is None or way.turn else [(way, farther)]
             other += [moved] if moved else []
 
     def first(found: list[_Way]) -> list[Placement]:
         looks = (_look(w, raw, cloth, skin, body) for w in found)
         return list(islice((k for k in looks if not k.pierced and k.threaded > 0.99 and k.inside < SUNK), 1))
 
-    kept = first(here) if len(here) == 1 else []
+    kept = first([here[0][0]]) if len(here) == 1 else []
+    farther = here[0][1] if kept else 0.0
+    also = ALSO.format(abs(100 * farther), "higher" if farther > 0 else "lower") if farther else ""
     other.sort(key=lambda w: w.cost)
     told = [k for unit in {w.scale for w in other} for k in first([w for w in other if w.scale == unit][:FINE])]
     return (
-        replace(kept[0], doubt="", warning=STAYED) if kept else None,
+        replace(kept[0], doubt=also, warning=STAYED) if kept else None,
         replace(told[0], doubt=HANGS) if len(told) == 1 else None,
     )
 
 
-def _waists(way: _Way, opening: np.ndarray, trunk: Trunk, skin: Skin) -> tuple[bool, _Way | None]:
-    """Return whether an opening fits around the trunk where the file has it, and the place where it fits best, if any."""
+def _waists(way: _Way, opening: np.ndarray, trunk: Trunk, skin: Skin) -> tuple[float | None, _Way | None]:
+    """Return how an opening fits around the trunk: where the file has it, how much farther up it would be held as well (m, 0:
+    nowhere; None: it does not fit); and the place where it fits best, if any."""
     tall, height = skin.height, float(opening[:, 1].mean())
     fit = opening_on(trunk, opening)
-    fits = (fit.ease > EASE[0] * tall) & (fit.ease < EASE[1] * tall) & (fit.misfit < SHAPED * tall)
-    if not fits.any():
-        return False, None
+    cost = fit.cost(tall)
+    if not np.isfinite(cost).any():
+        return None, None
     near = int(np.abs(fit.heights - height).argmin())
     close = abs(fit.heights[near] - height) < CENTRED * tall and np.linalg.norm(fit.shift[near]) < CENTRED * tall
-    cost = np.where(fits, fit.misfit + LIKE * np.abs(fit.ease - USUAL * tall), np.inf)
     best = int(np.where(trunk.carries(), cost, cost + SHAPED * tall).argmin())
     side, against = fit.shift[best], UPSIDE[0] * (way.up[0] == "-") + UPSIDE[1] * (way.turn > 0)
     shift = np.array([side[0], fit.heights[best] - height, side[1]])
     stays = close and cost[near] < cost[best] + SHAPED / 2 * tall
-    return bool(stays), replace(way, shift=shift, cost=float(cost[best] + against * tall))
+    return fit.farther(near, tall) if stays else None, replace(way, shift=shift, cost=float(cost[best] + against * tall))
