@@ -13,7 +13,7 @@ from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["FAR", "UNITS", "Opening", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
+__all__ = ["FAR", "UNITS", "Hole", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
 
 UNITS = {
     0.01: "centimetres",
@@ -35,8 +35,8 @@ FEW, SHORT = 6, 0.25  # nor is one of so few edges meant that is so much shorter
 
 
 @dataclass(frozen=True)
-class Opening:
-    """A loop of a surface's boundary: its edges, its length and mean height, m, and whether it is a small hole."""
+class Hole:
+    """A loop of a surface's boundary: its edges, its length and mean height, m, and whether it is a small one."""
 
     edges: int
     length: float
@@ -53,7 +53,7 @@ class SurfaceSummary:
     a normal."""
 
     components: int
-    openings: tuple[Opening, ...]
+    openings: tuple[Hole, ...]
     degenerate: int
 
 
@@ -68,12 +68,12 @@ def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
     return SurfaceSummary(components, _openings(x, boundary_loops(faces)), int((relative_heights(x, faces) <= LINE).sum()))
 
 
-def _openings(x: np.ndarray, loops: list[np.ndarray]) -> tuple[Opening, ...]:
+def _openings(x: np.ndarray, loops: list[np.ndarray]) -> tuple[Hole, ...]:
     lengths = [float(np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()) for loop in loops]
     found = []
     for loop, length in zip(loops, lengths, strict=True):
         small = length < SMALL or (len(loop) <= FEW and length < SHORT * max(lengths))
-        found.append(Opening(len(loop), length, float(x[loop, 1].mean()), small))
+        found.append(Hole(len(loop), length, float(x[loop, 1].mean()), small))
     return tuple(sorted(found, key=lambda opening: -opening.height))
 
 

@@ -81,7 +81,7 @@ def place(
 ) -> Placement:
     """Return the garment in the unit, with the axes and at the place in which it lies on the body.
 
-    Every unit and orientation is tried at places along the body, moved to where the misfit is least, and the best are compared.
+    Every unit and orientation is tried at places along the body, moved to where the misfit is least, and the best are compared:
 
         misfit = mean over the garment's area of  25 d^2 / (|d| + L)  inside the body,
                                                   L (1 - (n . n_skin) / (1 + (d / L)^2))  outside
@@ -107,7 +107,6 @@ def place(
     stays, hanging = (None, None) if move is not None else _hung(ways, raw, fine, skin, body)
     if stays is not None and not stays.doubt:
         return stays
-    hanging = stays or hanging
     here = [replace(w, shift=np.zeros(3) if move is None else np.asarray(move, float)) for w in ways]
     exact = [skin.nearest(w.points(fine.points), fine.normals @ w.turned) for w in here]
     near = [float(_misfit(*e, skin, press=ROUGH[1])) for e in exact]  # even if somewhat inside
@@ -125,10 +124,10 @@ def place(
     if move is not None:
         return replace(ranked[0][1], doubt="")
     chosen = _choose(ranked, fine, skin)
-    way = next(way for way, look in ranked if look.garment is chosen.garment)
+    way = next(w for w, look in ranked if look.garment is chosen.garment)
     chosen = _rested(chosen, way, raw, fine, skin, body)
     if chosen.doubt:
-        return hanging or chosen
+        return stays or hanging or chosen
     return (stays or replace(chosen, doubt=HANGS)) if _loose_tube(chosen, way, fine, skin) else chosen
 
 
