@@ -1,13 +1,14 @@
 """How often `ncs fit` brings a garment of another unit, axes and origin home: placed, refused, or wrong.
 
-    python -m benchmarks.placing [--seed 0] [--cases 40] [--hanging] [--shared ../shared/data] [--json FILE]
+    python -m benchmarks.placing [--seed 0] [--cases 40] [--hanging | --strapped] [--shared ../shared/data] [--json FILE]
 
 Garments of three bodies: the packaged one; a wider, smaller one that was written as .glb and read again; SMPL's, where
 `--shared` has it. On each: shells of its own skin (a top, long sleeves, leggings, shorts), a skirt and a loose dress that hang
 around it, and what was made for it elsewhere (the packaged garments; SMPL's T-shirt and those of GAPS). A case takes one, in
 a random unit, with a random axis up, turned about the vertical by a random quarter, up to 30 cm off its place along each axis.
 With `--hanging`, skirts and strapless dresses alone: of random height, length, ease and flare, around the trunk's sections or
-around ovals; every other one lies in its place already, and only its unit and its axes are unknown.
+around ovals; every other one lies in its place already, and only its unit and its axes are unknown. With `--strapped`, dresses
+on straps over the shoulders; every other one is off its place along the vertical alone.
 
 It is placed where it comes within 2 cm (mean over its vertices) of where it was made, in its unit; wrong where it is accepted
 elsewhere.
@@ -21,6 +22,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,7 @@ from ncs_jax import InputError, io
 from ncs_jax.geometry.surface_distance import border_of, signed_distance
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.surface import oriented
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.garment_placement import place
@@ -36,7 +39,7 @@ from ncs_jax.prepare.hanging import ANGLES, RAYS, trunk_of
 from ncs_jax.prepare.joint_names import anatomy
 from ncs_jax.prepare.retarget import body_names
 
-__all__ = ["garments_of", "hung_on", "main", "tried"]
+__all__ = ["garments_of", "hung_on", "main", "strapped_on", "tried"]
 
 UNITS = (1.0, 0.1, 0.01, 0.001, 0.0254, 0.3048)
 OFFSET, RIGHT = 0.3, 0.02  # m
@@ -131,6 +134,55 @@ def hung_on(body: BodyRecord, rng: np.random.Generator, rows: int = 20) -> Garme
     return GarmentRecord(np.concatenate(rings).astype(np.float32), np.concatenate(faces).astype(np.int32))
 
 
+def strapped_on(body: BodyRecord, rng: np.random.Generator, rows: int = 20, steps: int = 14) -> GarmentRecord:
+    """Return a dress on two straps, 4 to 12 mm above the shoulders, of random width, length and flare."""
+    shoulder, hip = _roles(body)["shoulder"], _roles(body)["hip"]
+    trunk, own = body.vertices[~_follows_arms(body)], body.vertices.astype(np.float64)
+    bottom = hip[1] - rng.uniform(0.05, 0.25) * np.ptp(own, axis=0).max()
+    tube = _hanging(trunk, shoulder[1] - rng.uniform(0.12, 0.17), bottom, ANGLES, rows)
+    x, gap, wide = tube.vertices.astype(np.float64), rng.uniform(0.004, 0.012), int(rng.integers(1, 3))
+    ring, out, faces = x[:ANGLES], [x], [tube.faces]
+    count, at = len(x), float(rng.uniform(0.45, 0.65) * np.abs(shoulder[0] - np.median(own[:, 0])))
+    for side in (1, -1):
+        front, back = (
+            int(
+                np.argmin(
+                    np.abs(ring[:, 0] - np.median(own[:, 0]) - side * at) + 9 * (z * (ring[:, 2] - ring[:, 2].mean()) < 0)
+                )
+            )
+            for z in (1, -1)
+        )
+        first = []
+        for k in range(wide + 1):
+            a, b = (front - side * k) % ANGLES, (back + side * k) % ANGLES
+            middle = _over(own, ring[a], ring[b], gap, steps)
+            first.append(np.array([a, *range(count, count + steps), b]))
+            out, count = [*out, middle], count + steps
+        for p, q in pairwise(first):
+            faces += [np.stack(t, axis=1) for t in ((p[:-1], q[:-1], p[1:]), (p[1:], q[:-1], q[1:]))]
+    rim, straps = border_of(body.faces, len(own)), np.concatenate(out[1:])
+    for _ in range(20):
+        straps[:, 1] += np.maximum(gap - signed_distance(straps, own, body.faces, rim), 0)
+    x, triangles = np.concatenate([out[0], straps]), np.concatenate(faces).astype(np.int32)
+    return GarmentRecord(x.astype(np.float32), oriented(Path("dress"), x, triangles)[0])
+
+
+def _over(own: np.ndarray, a: np.ndarray, b: np.ndarray, gap: float, steps: int) -> np.ndarray:
+    """Return points (S, 3) of a strap from a to b, stretched over the skin (V, 3) and lifted from it by a gap, m."""
+    middle = (a[0] + b[0]) / 2
+    skin = own[(np.abs(own[:, 0] - middle) < 0.02) & (own[:, 1] > min(a[1], b[1]) - 0.02)][:, [2, 1]]
+    skin = skin[(skin[:, 0] > b[2]) & (skin[:, 0] < a[2])]
+    angle = np.linspace(0, np.pi, 200)
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # from forward over up to backward
+    hull = np.concatenate([skin + gap * np.array([0.0, 1.0]), a[None, [2, 1]], b[None, [2, 1]]])
+    chain = hull[(hull @ ray.T).argmax(axis=0)]
+    chain = np.concatenate([a[None, [2, 1]], chain[(chain[:, 0] < a[2]) & (chain[:, 0] > b[2])], b[None, [2, 1]]])
+    along = np.append(0, np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1)))
+    t = np.linspace(0, along[-1], steps + 2)[1:-1]
+    z, y = (np.interp(t, along, chain[:, k]) for k in (0, 1))
+    return np.stack([np.interp(t, [0, along[-1]], [a[0], b[0]]), y, z], axis=1)
+
+
 def _quads(first: int, around: int, k: np.ndarray, after: np.ndarray):
     low = first + around
     return (first + k, first + after, low + k), (first + after, low + after, low + k)
@@ -170,13 +222,13 @@ def _at_home(garment: GarmentRecord, body: BodyRecord) -> GarmentRecord:
     return replace(garment, vertices=(garment.vertices + best).astype(np.float32))
 
 
-def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator, *, stays: bool = False) -> dict:
+def tried(garment: GarmentRecord, body: BodyRecord, rng: np.random.Generator, along: tuple = (1, 1, 1)) -> dict:
     """Return how one garment is placed from a random unit, axis and offset: what came out, its error, m, and why not.
 
-    stays: it is not turned and has no offset.
+    along: how much of the offset it has along each axis; if not all, it is not turned.
     """
-    unit, up, quarters = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)], 0 if stays else int(rng.integers(4))
-    offset = np.zeros(3) if stays else rng.uniform(-OFFSET, OFFSET, 3)
+    unit, up = UNITS[rng.integers(len(UNITS))], "xyz"[rng.integers(3)]
+    quarters, offset = int(rng.integers(4)) if all(along) else 0, rng.uniform(-OFFSET, OFFSET, 3) * along
     case = {"unit": unit, "up": up, "turn": 90 * quarters}
     quarter = np.linalg.matrix_power(np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]), quarters)
     x = (garment.vertices @ quarter + offset) @ TURNS[up].T / unit
@@ -194,7 +246,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", type=int, default=40)
-    parser.add_argument("--hanging", action="store_true", help="skirts and strapless dresses alone")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--hanging", action="store_true", help="skirts and strapless dresses alone")
+    kinds.add_argument("--strapped", action="store_true", help="dresses on straps alone")
     parser.add_argument("--shared", type=Path, default=Path("../shared/data"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
@@ -204,10 +258,13 @@ def main(arguments: list[str] | None = None) -> int:
     order = np.concatenate([rng.permutation(len(cast)) for _ in range(-(-options.cases // len(cast)))])
     for number, case in enumerate(order[: options.cases]):
         name, body, garment = cast[case]
-        if options.hanging:
+        along = (1, 1, 1)
+        if options.hanging or options.strapped:
             label = tuple(bodies)[number // 2 % len(bodies)]
-            name, body, garment = f"{label} hanging", bodies[label], hung_on(bodies[label], rng)
-        row = {"garment": name, **tried(garment, body, rng, stays=options.hanging and number % 2 == 0)}
+            kind, made = ("hanging", hung_on) if options.hanging else ("strapped", strapped_on)
+            name, body, garment = f"{label} {kind}", bodies[label], made(bodies[label], rng)
+            along = along if number % 2 else (0, int(options.strapped), 0)
+        row = {"garment": name, **tried(garment, body, rng, along)}
         rows.append(row)
         error = "" if row["error"] is None else f"{1000 * row['error']:.0f} mm"
         print(

@@ -16,6 +16,7 @@ from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare import garment_placement
 from ncs_jax.prepare.fit import BAND, fit
 from ncs_jax.prepare.garment_placement import place
+from ncs_jax.prepare.hanging import RAYS, trunk_of
 from ncs_jax.prepare.wearing import cloth_of, skin_of
 
 from .scenes import post, write_scene
@@ -45,7 +46,7 @@ def inside(points, body):
 @pytest.mark.parametrize("radius", [0.085, 0.075, 0.06])
 def test_a_garment_inside_the_body_comes_out_of_it(body, radius):
     given = sleeve(radius)
-    found = fit("g.npz", given, body, clearance=0.004)
+    found = fit("g.npz", given, body, clearance=0.004, move=(0, 0, 0))
     x, edges = found.garment.vertices, topology(given.faces)[0]
     assert inside(x, body).max() < -0.0038 and inside(x[edges].mean(axis=1), body).max() < -0.0038
     if radius < 0.08:
@@ -57,9 +58,10 @@ def test_a_garment_inside_the_body_comes_out_of_it(body, radius):
 
 def test_a_garment_that_fits_stays_as_it_is(body):
     given = sleeve(0.1)
-    found = fit("g.npz", given, body)
+    found = fit("g.npz", given, body, move=(0, 0, 0))
     np.testing.assert_array_equal(found.garment.vertices, given.vertices)
-    assert not found.placement.shift.any()
+    with pytest.raises(InputError, match="girth of its waist"):  # the post is alike from top to bottom
+        fit("g.npz", given, body)
 
 
 @pytest.mark.parametrize(("scale", "up"), [(0.01, "z"), (0.0254, "y"), (1.0, "z")])
@@ -148,11 +150,11 @@ def test_a_place_that_is_given_is_kept():
 
 
 def test_what_nothing_carries_is_pinned_around_its_highest_hole(body):
-    found = fit("g.npz", sleeve(0.1), body).garment
+    found = fit("g.npz", sleeve(0.1), body, move=(0, 0, 0)).garment
     top = found.vertices[:, 1].max()
     np.testing.assert_array_equal(found.groups["pins"], np.flatnonzero(found.vertices[:, 1] >= top - BAND - 1e-6))
     own = io.GarmentRecord(found.vertices, found.faces, groups={"pins": np.array([3, 4], np.int32)})
-    np.testing.assert_array_equal(fit("g.npz", own, body).garment.groups["pins"], [3, 4])
+    np.testing.assert_array_equal(fit("g.npz", own, body, move=(0, 0, 0)).garment.groups["pins"], [3, 4])
 
 
 def test_what_lies_on_top_of_the_body_needs_no_pins(body):
@@ -175,7 +177,7 @@ def test_weights_do_not_tear_a_skirt_between_the_legs():
     from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights
 
     body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
-    found = fit("skirt.npz", skirt, body).garment
+    found = fit("skirt.npz", skirt, body, move=(0, 0, 0)).garment
     edges, rest = topology(skirt.faces)[0], skirt.vertices
     plain = smooth_weights(transfer_weights(rest, body.vertices, body.faces, body.weights), edges, 10)
     skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
@@ -201,7 +203,7 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     tilted = 100 * given.vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     trimesh.Trimesh(tilted, given.faces, process=False).export(tmp_path / "g.obj")
     command = ["fit", str(tmp_path / "g.obj"), "--body", str(tmp_path / "body.npz"), "--out"]
-    assert main([*command, str(tmp_path / "fitted.npz")]) == 0
+    assert main([*command, str(tmp_path / "fitted.npz"), "--stay"]) == 0
     told = capsys.readouterr().out
     assert "0.01 m a unit, Z up" in told and "0 inside now" in told and 'pins = "pins"' in told
     assert (tmp_path / "fitted.png").read_bytes()[:4] == b"\x89PNG"
@@ -271,14 +273,37 @@ def test_units_are_compared_only_once_the_best_place_of_each_is_refined(monkeypa
     assert len([most for _, most in refined if most == 100]) == garment_placement.FINE  # and only these to the end
 
 
+def hung_at(y, ease=0.01):
+    """A flared tube that hangs from the packaged body's trunk at a height, m, and is wider there by its ease on all sides."""
+    trunk = trunk_of(io.read_body(ASSETS / "body.npz"))
+    reach, count = trunk.reach[np.abs(trunk.heights - y).argmin()], len(RAYS)
+    middle = reach @ RAYS * 2 / count
+    rings = [np.insert((reach - RAYS @ middle + ease + 0.3 * down)[:, None] * RAYS + middle, 1, y - down, 1) for down in
+             np.linspace(0, 0.4, 12)]  # fmt: skip
+    return io.GarmentRecord(np.concatenate(rings), tube(count, 12)[1])
+
+
 @pytest.mark.parametrize(("scale", "up"), [(0.01, "z"), (0.0254, "x")])
 def test_a_skirt_that_hangs_where_its_file_has_it_stays_there(scale, up):
-    """Its waist fits around the trunk in one unit and axis alone, though it lies about as well elsewhere."""
-    body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
-    found = place("g.obj", replace(skirt, vertices=skirt.vertices @ TURNS[up].T / scale, weights=None), body)
+    """Its waist fits around the trunk in one unit and axis alone, and nowhere else above or below."""
+    body, skirt = io.read_body(ASSETS / "body.npz"), hung_at(0.885)
+    found = place("g.obj", replace(skirt, vertices=skirt.vertices @ TURNS[up].T / scale), body)
     assert not found.doubt and (found.scale, found.up, found.turn) == (scale, up, 0) and not found.shift.any()
     assert "only its waist tells where" in found.warning
     np.testing.assert_allclose(found.garment.vertices, skirt.vertices, atol=1e-6)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.038])
+def test_a_skirt_whose_waist_is_held_as_well_higher_or_lower_is_refused_though_it_fits(off):
+    """The packaged one fits as well four centimetres above its place: whether its file has it there or here, none can tell."""
+    body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
+    x = (skirt.vertices + [0, off, 0]) @ TURNS["z"].T / 0.0254
+    given = replace(skirt, vertices=x, weights=None)
+    found = place("g.obj", given, body)
+    assert (found.scale, found.up) == (0.0254, "z") and not found.shift.any()
+    with pytest.raises(InputError, match=r"held as well \d+ cm (higher|lower).*--stay"):
+        found.check("g.obj")
+    place("g.obj", given, body, move=(0, 0, 0)).check("g.obj")
 
 
 def test_a_skirt_off_its_place_is_refused_with_the_unit_and_the_place_that_its_waist_tells():

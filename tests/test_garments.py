@@ -280,16 +280,16 @@ def test_formats_that_split_vertices_are_welded_where_they_are_at_one_place(tmp_
 def test_anatomy():
     x, faces = tube()
     found = summarise_surface(x, faces)
-    assert (found.components, found.loops, found.degenerate) == (1, 2, 0)
+    assert (found.components, len(found.openings), found.degenerate) == (1, 2, 0)
     x, faces = ball(1)
-    assert summarise_surface(x, faces).loops == 0
+    assert not summarise_surface(x, faces).openings
     pinched = faces[~(faces == 0).any(axis=1)]  # a hole where a vertex was
-    assert summarise_surface(x, pinched).loops == 1
+    assert len(summarise_surface(x, pinched).openings) == 1
     x, faces = sheet(2, 3)
     both = np.concatenate([faces, faces + len(x)])
     assert summarise_surface(np.concatenate([x, x + 1]), both).components == 2
     # Two triangles that meet in a vertex alone: one piece, two borders that touch.
-    assert summarise_surface(np.eye(5)[:, :3], np.array([[0, 1, 2], [2, 3, 4]])).loops == 2
+    assert len(summarise_surface(np.eye(5)[:, :3], np.array([[0, 1, 2], [2, 3, 4]])).openings) == 2
     flat = np.array([[0, 0, 0], [1, 0, 0], [2, 1e-7, 0], [1, 1, 0]], float)
     assert summarise_surface(flat, np.array([[0, 1, 2], [0, 2, 3]])).degenerate == 1
 
@@ -362,6 +362,46 @@ def test_a_garment_that_nothing_brings_onto_the_body():
         check_on_body(Path("g.npz"), garment(grid()[0] * 1e5), body, axis_given=False)
 
 
+def test_a_small_hole_is_told_from_openings():
+    """A quad that is missing, 16 cm around, between openings of 2.2 m; a wrist of as many edges is no hole beside them."""
+    x, faces = tube(36, 12, 0.35, 0.4)
+    around = np.linalg.norm(x[0] - x[1]) * 2 + 0.8 / 11
+    ends = summarise_surface(x, np.delete(faces, [400, 401], axis=0)).openings
+    assert [o.small for o in ends] == [False, True, False] and ends[1].edges == 4
+    assert ends[1].length == pytest.approx(around) and ends[0].length == pytest.approx(36 * np.linalg.norm(x[0] - x[1]))
+    assert not any(o.small for o in summarise_surface(*tube(6, 3, 0.03, 0.2)).openings)
+    assert all(o.small for o in summarise_surface(*tube(30, 3, 0.01, 0.2)).openings)
+
+
+def turned_round(faces, which):
+    return np.where(which[:, None], faces[:, [0, 2, 1]], faces)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.45, 0.6, 1.0])
+def test_triangles_that_face_the_other_side_are_turned(tmp_path, rng, share):
+    """To where most look, or outward where about half do; what agrees stays, inward too; another component is left alone."""
+    x, faces = tube(20, 8, 0.2, 0.6)
+    wrong = rng.random(len(faces)) < share
+    both = np.concatenate([turned_round(faces, wrong), faces + len(x)])
+    np.savez(tmp_path / "g.npz", vertices=np.concatenate([x, x + [1, 0, 0]]), faces=both)
+    if share < 1:
+        with pytest.raises(InputError, match=r"facing the same side expected.*`ncs fit` turn them"):
+            io.read_garment(tmp_path / "g.npz")
+    read = io.read_garment(tmp_path / "g.npz", turn_faces=True)
+    np.testing.assert_array_equal(read.faces, np.concatenate([faces if share < 1 else both[: len(faces)], faces + len(x)]))
+    told = f"{wrong.sum()} of {len(both)} triangles faced the other side than their neighbours, the first is face "
+    assert [n.startswith(told + str(np.flatnonzero(wrong)[0])) for n in read.notes] == [True] * (share < 1)
+
+
+def test_a_surface_of_one_side_is_refused(tmp_path):
+    x, faces = tube(12, 2)
+    pairs = {0: 12, 12: 0}
+    cut = [[pairs.get(v, v) for v in f] if f in faces[-2:].tolist() else f for f in faces.tolist()]  # joined with a half turn
+    np.savez(tmp_path / "g.npz", vertices=x, faces=cut)
+    with pytest.raises(InputError, match=r"faces: a surface with two sides.*Moebius.*24 triangles.*the first is face 0.*cut"):
+        io.read_garment(tmp_path / "g.npz", turn_faces=True)
+
+
 def test_only_npz_is_written(tmp_path):
     with pytest.raises(InputError, match=r"shirt\.obj: a file name that ends in \.npz expected"):
         io.write_garment(tmp_path / "shirt.obj", garment(grid()[0]))
@@ -373,13 +413,13 @@ def test_check_says_what_a_garment_is_made_of(tmp_path, capsys):
     assert main(["check", str(scene)]) == 0
     text = capsys.readouterr().out
     assert "30 vertices, 40 triangles" in text
-    assert "connected components 1, boundary loops (holes) 1, degenerate triangles 0" in text
+    assert "connected components 1, openings 1, small holes 0, degenerate triangles 0" in text
     assert "1 m a unit, Y up; vertices in the file's number and order" in text
     np.savez(tmp_path / "cloth.npz", **dict(zip(("vertices", "faces"), pieces(*grid()), strict=True)))
     assert main(["check", str(scene)]) == 0
     text = capsys.readouterr().out
-    assert "connected components 40, boundary loops (holes) 40" in text and "garment.weld" in text
+    assert "components 40, openings 40, small holes 0" in text and "garment.weld" in text
     scene.write_text(scene.read_text().replace("smoothing = 2", "smoothing = 2\nweld = 0.001"))
     assert main(["check", str(scene)]) == 0
     text = capsys.readouterr().out
-    assert "connected components 1, boundary loops (holes) 1" in text and "90 vertices welded to others" in text
+    assert "connected components 1, openings 1" in text and "90 vertices welded to others" in text

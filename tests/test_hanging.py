@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_jax import io
-from ncs_jax.prepare.hanging import opening_on, trunk_of, upper_opening
+from ncs_jax.prepare.hanging import ANGLES, RAYS, Trunk, opening_on, trunk_of, upper_opening
 
 from .shapes import tube
 
@@ -46,6 +46,17 @@ def test_an_opening_tells_its_height_ease_and_middle():
     assert fit.heights[best] == pytest.approx(0.6, abs=0.01) and fit.ease[best] == pytest.approx(0.005, abs=5e-4)
     np.testing.assert_allclose(fit.shift[best], [-0.03, 0.02], atol=1e-4)
     assert fit.misfit[best] < 1e-4 and fit.misfit[best + 30] > 5 * fit.misfit[best]
+
+
+@pytest.mark.parametrize(("shape", "up"), [((1.0, 1.0), 0.0), ((1.0, 0.0), 0.1), ((0.0, 1.0), -0.1)])
+def test_a_waist_is_held_as_well_elsewhere_where_the_trunk_is_as_wide_and_in_line(shape, up):
+    """A round trunk, 10 cm in radius at 1 m, of another girth 10 cm below and above (1) or of the same there (0)."""
+    heights = np.array([0.9, 1.0, 1.1])
+    trunk = Trunk(heights, np.repeat([[0.1 + 0.03 * shape[0]], [0.1], [0.1 + 0.03 * shape[1]]], ANGLES, axis=1))
+    waist = ring(0.11, 0.11, 1.0, around=480)
+    assert opening_on(trunk, waist).farther(1, tall=1.7) == pytest.approx(up, abs=1e-9)
+    bent = Trunk(heights, trunk.reach + np.array([[0.02], [0], [0.02]]) * RAYS[:, 1])  # it is not in line there
+    assert opening_on(bent, waist).farther(1, tall=1.7) == 0.0
 
 
 def test_a_tube_hangs_from_its_upper_opening():

@@ -98,8 +98,12 @@ def _tell_scene(setting: Setting, *, automatic: bool) -> None:
     tell("garment", f"{mesh.rest.shape[0]} vertices, {mesh.faces.shape[0]} triangles, {size}")
     record = setting.garment
     parts = summarise_surface(record.vertices, record.faces)
-    counts = f"connected components {parts.components}, boundary loops (holes) {parts.loops}"
-    tell("surface", f"{counts}, degenerate triangles {parts.degenerate}")
+    holes = [opening for opening in parts.openings if opening.small]
+    counts = f"connected components {parts.components}, openings {len(parts.openings) - len(holes)}"
+    tell("surface", f"{counts}, small holes {len(holes)}, degenerate triangles {parts.degenerate}")
+    if holes:
+        more = f" and {len(holes) - 3} more" if len(holes) > 3 else ""
+        tell("holes", "; ".join(map(str, holes[:3])) + more + ": meant?")
     kept = f"{record.welded} vertices welded to others" if record.welded else "vertices in the file's number and order"
     tell("file", f"{record.scale:g} m a unit, {record.up.upper()} up; {kept}")
     if setting.body is not None and model.body is not None:

@@ -47,7 +47,11 @@ def add_commands(commands) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--stay", action="store_true", help="do not move it, whatever speaks for another place")
     where.add_argument(
-        "--move", type=arguments.finite, nargs=3, metavar=("X", "Y", "Z"), help="move it by this, metres (default: found)"
+        "--move",
+        type=arguments.finite,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="move it by this, metres along the body's axes, Y up, once unit and axes are found (default: found)",
     )
     parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="merge vertices within M metres")
     parser.add_argument(
@@ -74,13 +78,16 @@ def fit(options) -> int:
         )
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
-    given = with_body_weights(io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh), source)
+    given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
+    given = with_body_weights(given, source)
     known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
     move = (0.0, 0.0, 0.0) if options.stay else options.move
     placement = place(options.garment, given, source, move=move, **known)
     print(
         f"{options.garment} on {options.source or options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles"
     )
+    for note in given.notes:
+        print(f"  note      {note}")
     _say_where(placement)
     picture = out.with_suffix(".png")
     if options.source:
@@ -164,7 +171,6 @@ def _say_what(found, given) -> None:
     """Print what was done to the garment at its place, and what it is made of."""
     import numpy as np
 
-    from ncs_jax.io.mesh.surface import boundary_loops
     from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.garment_checks import summarise_surface
 
@@ -176,13 +182,12 @@ def _say_what(found, given) -> None:
     print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
     _say_contact(found.contact)
     print(f"  surface   connected components {parts.components}, degenerate triangles {parts.degenerate}")
-    for loop in sorted(boundary_loops(g.faces), key=lambda loop: -x[loop, 1].mean()):
-        long = np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()
-        print(f"  hole      {len(loop)} edges, {100 * long:.0f} cm around, at a height of {x[loop, 1].mean():.2f} m")
+    for opening in parts.openings:
+        print(f"  hole      a small one, {opening}: meant?" if opening.small else f"  opening   {opening}")
     if PINS in given.groups:
         print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:
-        print(f"  pins      {len(g.groups[PINS])} vertices around its highest hole: nothing else carries it")
+        print(f"  pins      {len(g.groups[PINS])} vertices around its highest opening: nothing else carries it")
     else:
         print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
     spread = f"the body's where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread smoothly from there"

@@ -24,8 +24,8 @@ from ncs_jax.geometry.surface_distance import border_of, closest_on_surface, dis
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.fit import lying_on, spread, spread_weights
-from ncs_jax.prepare.garment_placement import Placement
 from ncs_jax.prepare.joint_names import Limbs, anatomy
+from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.posing import skinned
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.skeleton import body_axes, least_turn

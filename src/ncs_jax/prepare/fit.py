@@ -15,7 +15,8 @@ from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.covering import Cover, contact_for, sinking
 from ncs_jax.prepare.garment_checks import FAR
-from ncs_jax.prepare.garment_placement import Placement, place
+from ncs_jax.prepare.garment_placement import place
+from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.skinning_weights import transfer_weights
 
 __all__ = ["PINS", "Fitted", "fit", "lying_on", "pins_of", "push_out", "settle", "spread", "spread_weights"]

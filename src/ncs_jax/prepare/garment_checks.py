@@ -13,7 +13,7 @@ from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["FAR", "UNITS", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
+__all__ = ["FAR", "UNITS", "Hole", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
 
 UNITS = {
     0.01: "centimetres",
@@ -30,26 +30,51 @@ UNITS = {
 }  # metres a unit of a file, and its name
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
+SMALL = 0.12  # m: no head, hand or foot passes through a shorter opening,
+FEW, SHORT = 6, 0.25  # nor is one of so few edges meant that is so much shorter than the longest
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A loop of a surface's boundary: its edges, its length and mean height, m, and whether it is a small one."""
+
+    edges: int
+    length: float
+    height: float
+    small: bool
+
+    def __str__(self) -> str:
+        return f"{self.edges} edges, {100 * self.length:.0f} cm around, at a height of {self.height:.2f} m"
 
 
 @dataclass(frozen=True)
 class SurfaceSummary:
-    """Numbers of a surface: connected components, loops of the boundary (holes), triangles too slim to have a normal."""
+    """A surface's number of connected components, its openings, the highest first, and its number of triangles too slim to have
+    a normal."""
 
     components: int
-    loops: int
+    openings: tuple[Hole, ...]
     degenerate: int
 
 
 def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:
-    """Count the components, holes and degenerate triangles of a surface that `check_surface` has passed."""
+    """Return what a surface is made of that `check_surface` has passed: vertices (V, 3), m, and triangles (F, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     graph = coo_array((np.ones(len(half), bool), tuple(half.T)), shape=(len(x), len(x)))
     components = int(connected_components(graph, directed=False)[0])
-    return SurfaceSummary(components, len(boundary_loops(faces)), int((relative_heights(x, faces) <= LINE).sum()))
+    return SurfaceSummary(components, _openings(x, boundary_loops(faces)), int((relative_heights(x, faces) <= LINE).sum()))
+
+
+def _openings(x: np.ndarray, loops: list[np.ndarray]) -> tuple[Hole, ...]:
+    lengths = [float(np.linalg.norm(x[loop] - np.roll(x[loop], 1, axis=0), axis=1).sum()) for loop in loops]
+    found = []
+    for loop, length in zip(loops, lengths, strict=True):
+        small = length < SMALL or (len(loop) <= FEW and length < SHORT * max(lengths))
+        found.append(Hole(len(loop), length, float(x[loop, 1].mean()), small))
+    return tuple(sorted(found, key=lambda opening: -opening.height))
 
 
 def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_given: bool) -> None:

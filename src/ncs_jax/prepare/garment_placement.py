@@ -13,11 +13,13 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.garment_checks import UNITS
-from ncs_jax.prepare.hanging import Trunk, opening_on, trunk_of, upper_opening
+from ncs_jax.prepare.hanging import CENTRED, SHAPED, Trunk, opening_on, trunk_of, upper_opening
+from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.retarget import body_names
+from ncs_jax.prepare.straps import lift_to_rest
 from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, pierced, skin_of, threaded
 
-__all__ = ["AXES", "TURNED", "Placement", "place"]
+__all__ = ["AXES", "TURNED", "place"]
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")  # that may be up in a file
 TURNED = {0: 1.0, 90: 0.6, 180: 0.75, 270: 0.6}  # degrees about the vertical, and how much such a place counts
@@ -37,63 +39,17 @@ RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on,
 APART = 0.02  # of the height: what is nearer is no other place
 FLAT, AWAY = 1.15, 1 / 40  # a place is uncertain where this much of the height away the misfit rises less than so many times
 HELD = 0.15, 1.0  # but not upward, where it loses so much of its contact, and so much as far down: something carries it
-EASE = -0.002, 0.02  # of the height: the waist of what hangs is wider than the trunk on all sides by between these,
-SHAPED, CENTRED = 0.004, 0.006  # and so far, at most, are its shape from the trunk's and, if it stays, its middle from there
-USUAL, LIKE = 0.006, 0.25  # of the height: it is most often wider by this, and how much less that counts than its shape
-CLOSE = (
-    0.4  # of the misfit of cloth that is nowhere near the skin: a tube of less misfit fits closely, and its place is certain
-)
+CLOSE = 0.4  # of the misfit of cloth that is nowhere near: a tube of less misfit fits closely, and its place is certain
+STRAPPED = 4, 1 / 25  # openings of a garment with straps or shoulders, at least, and of the height: each is larger than this
+RESTING = -0.009, 0.003  # of the height: if its straps are to be lifted by between these, they rest where the file has them,
+PRESSED = 0.008  # and up to this where it was moved: the best place is somewhat inside the body
+RESTS = "its straps tell the height at which they rest on the body, but it is so loose that its place sideways is uncertain"
 SUNK = 0.1  # of its area may be inside the body: it is pushed out
 STAYED = "it hangs, and only its waist tells where: it stays at the height that the file has"
+ALSO = "it hangs around the trunk where the file has it, but its waist would be held as well {:.0f} cm {}"
+KEEP = "; --stay keeps it here"
 HANGS = "it hangs, and the girth of its waist tells its height only to some centimetres"
 UPSIDE = 0.002, 0.0005  # of the height: what a place upside down, and one turned about the vertical, has less in its favour
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """A garment brought to where it lies best, and how well it lies there.
-
-    garment: in metres and Y up at its place. scale, up, turn: metres a unit of the file, the axis that is up in it, and the
-    turn about the vertical after it, degrees. mirrored: left and right were exchanged. shift (3,): how it was moved then, m.
-    lying, inside: shares of its area on the skin, and inside the body. pierced: joints whose bones pass through the cloth.
-    threaded: share of its openings, by length, that the body passes through. doubt: what speaks against it; empty: nothing.
-    warning: what is left uncertain in a place that is accepted.
-    """
-
-    garment: GarmentRecord
-    scale: float
-    up: str
-    turn: int
-    mirrored: bool
-    shift: np.ndarray
-    lying: float
-    inside: float
-    pierced: tuple[str, ...]
-    threaded: float
-    doubt: str = ""
-    warning: str = ""
-
-    @property
-    def worn(self) -> bool:
-        """Tell whether the body passes through all openings, no bone through the cloth, and next to nothing is inside."""
-        return not self.pierced and self.threaded > 0.99 and self.inside < 0.01
-
-    @property
-    def options(self) -> str:
-        """Return the options of `ncs fit` that bring it exactly here."""
-        x, y, z = self.shift
-        turn = f" --turn {self.turn}" if self.turn else ""
-        return f"--scale {self.scale:g} --up={self.up}{turn} --move {x:.3f} {y:.3f} {z:.3f}"
-
-    def check(self, file: str | Path) -> None:
-        """Raise an InputError where the place is in doubt."""
-        if self.doubt:
-            other = "if it was made for another body, name that by --from; " if self.pierced or self.threaded <= 0.99 else ""
-            raise InputError(
-                f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
-                value=f"as its best place {self.options}", mend=f"{other}if the picture is right, give these options; "
-                "else others of --scale, --up, --turn and --move, or --stay",
-            )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +82,7 @@ def place(
 ) -> Placement:
     """Return the garment in the unit, with the axes and at the place in which it lies on the body.
 
-    Every unit and orientation is tried at places along the body, moved to where the misfit is least, and the best are compared.
+    Every unit and orientation is tried at places along the body, moved to where the misfit is least, and the best are compared:
 
         misfit = mean over the garment's area of  25 d^2 / (|d| + L)  inside the body,
                                                   L (1 - (n . n_skin) / (1 + (d / L)^2))  outside
@@ -150,7 +106,7 @@ def place(
             value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state its unit with --scale",
         )  # fmt: skip
     stays, hanging = (None, None) if move is not None else _hung(ways, raw, fine, skin, body)
-    if stays is not None:
+    if stays is not None and not stays.doubt:
         return stays
     here = [replace(w, shift=np.zeros(3) if move is None else np.asarray(move, float)) for w in ways]
     exact = [skin.nearest(w.points(fine.points), fine.normals @ w.turned) for w in here]
@@ -169,9 +125,11 @@ def place(
     if move is not None:
         return replace(ranked[0][1], doubt="")
     chosen = _choose(ranked, fine, skin)
+    way = next(w for w, look in ranked if look.garment is chosen.garment)
+    chosen = _rested(chosen, way, raw, fine, skin, body)
     if chosen.doubt:
-        return hanging or chosen
-    return replace(chosen, doubt=HANGS) if _loose_tube(chosen, ranked, fine, skin) else chosen
+        return stays or hanging or chosen
+    return (stays or replace(chosen, doubt=HANGS)) if _loose_tube(chosen, way, fine, skin) else chosen
 
 
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
@@ -297,6 +255,20 @@ def _ranked(seen: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> lis
     return sorted(seen, key=lambda r: (bool(r[1].doubt), r[1].lying < ON_BODY, -_value(r[0], cloth, skin)))
 
 
+def _rested(chosen: Placement, way: _Way, raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRecord) -> Placement:
+    """Return a loose garment with straps or shoulders at the height at which they rest on the body, in doubt if it was moved by
+    that: cloth that hangs free hides how little of it carries the rest."""
+    large = sum(np.linalg.norm(np.ptp(raw.vertices[k], axis=0)) * way.scale > STRAPPED[1] * skin.height for k in cloth.loops)
+    if chosen.pierced or chosen.threaded <= 0.99 or way.cost < CLOSE * SKIN * skin.height or large < STRAPPED[0]:
+        return chosen
+    lift = lift_to_rest(way.points(raw.vertices), raw.faces, body)
+    most = PRESSED if way.shift.any() else RESTING[1]
+    if lift is None or RESTING[0] * skin.height < lift < most * skin.height:
+        return chosen
+    found = _look(replace(way, shift=way.shift + [0, lift, 0]), raw, cloth, skin, body)
+    return replace(found, doubt=found.doubt or chosen.doubt or RESTS, warning="")
+
+
 def _choose(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> Placement:
     """Return the best place, or the garment's own where that is about as good, with what speaks against it."""
     way, best = ranked[0]
@@ -387,53 +359,56 @@ def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
     return "", warning
 
 
-def _loose_tube(chosen: Placement, ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> bool:
-    """Tell whether a garment that was moved only hangs there: it lies closest some centimetres lower than where it was made."""
-    way = next(way for way, look in ranked if look.garment is chosen.garment)
+def _loose_tube(chosen: Placement, way: _Way, cloth: Cloth, skin: Skin) -> bool:
+    """Tell whether a garment only hangs there: it lies closest some centimetres lower than where it was made."""
     loops = [chosen.garment.vertices[loop] for loop in cloth.loops]
-    return bool(way.shift.any()) and way.cost > CLOSE * SKIN * skin.height and upper_opening(loops) is not None
+    return way.cost > CLOSE * SKIN * skin.height and upper_opening(loops) is not None
 
 
 def _hung(ways: list[_Way], raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRecord) -> tuple[Placement | None, ...]:
     """Return where a skirt or a strapless dress hangs, by its upper opening: where the file has it, and else.
 
-    The first is None where it does not hang there in one unit and upright axis alone: by chance none does. The second is None
-    where the opening does not tell the unit. It is in doubt, because girth and shape of a waist that is wider than the trunk
-    fit several centimetres higher and lower.
+    The first is None where it does not hang there in one unit and upright axis alone: by chance none does. Where the waist
+    would be held as well higher or lower, it is in doubt; in the file's own unit and axes, that is only said. The second is
+    None where the opening does not tell the unit. It is in doubt, because girth and shape of a waist that is wider than the
+    trunk fit several centimetres higher and lower.
     """
     here, other, trunk = [], [], trunk_of(body)
     for way in ways:
         opening = upper_opening([way.points(raw.vertices[loop]) for loop in cloth.loops])
         if opening is not None:
-            stays, moved = _waists(way, opening, trunk, skin)
-            here += [way] * (stays and not way.turn)
+            farther, moved = _waists(way, opening, trunk, skin)
+            here += [] if farther is None or way.turn else [(way, farther)]
             other += [moved] if moved else []
 
     def first(found: list[_Way]) -> list[Placement]:
         looks = (_look(w, raw, cloth, skin, body) for w in found)
         return list(islice((k for k in looks if not k.pierced and k.threaded > 0.99 and k.inside < SUNK), 1))
 
-    kept = first(here) if len(here) == 1 else []
+    kept = first([here[0][0]]) if len(here) == 1 else []
+    at, farther = here[0] if kept else (None, 0.0)
+    also = ALSO.format(abs(100 * farther), "higher" if farther > 0 else "lower") if farther else ""
+    doubt, warning = (also + KEEP, STAYED) if also and at is not None and not at.own else ("", also or STAYED)
     other.sort(key=lambda w: w.cost)
     told = [k for unit in {w.scale for w in other} for k in first([w for w in other if w.scale == unit][:FINE])]
     return (
-        replace(kept[0], doubt="", warning=STAYED) if kept else None,
+        replace(kept[0], doubt=doubt, warning=warning) if kept else None,
         replace(told[0], doubt=HANGS) if len(told) == 1 else None,
     )
 
 
-def _waists(way: _Way, opening: np.ndarray, trunk: Trunk, skin: Skin) -> tuple[bool, _Way | None]:
-    """Return whether an opening fits around the trunk where the file has it, and the place where it fits best, if any."""
+def _waists(way: _Way, opening: np.ndarray, trunk: Trunk, skin: Skin) -> tuple[float | None, _Way | None]:
+    """Return how an opening fits around the trunk: where the file has it, how much farther up it would be held as well (m, 0:
+    nowhere; None: it does not fit); and the place where it fits best, if any."""
     tall, height = skin.height, float(opening[:, 1].mean())
     fit = opening_on(trunk, opening)
-    fits = (fit.ease > EASE[0] * tall) & (fit.ease < EASE[1] * tall) & (fit.misfit < SHAPED * tall)
-    if not fits.any():
-        return False, None
+    cost = fit.cost(tall)
+    if not np.isfinite(cost).any():
+        return None, None
     near = int(np.abs(fit.heights - height).argmin())
     close = abs(fit.heights[near] - height) < CENTRED * tall and np.linalg.norm(fit.shift[near]) < CENTRED * tall
-    cost = np.where(fits, fit.misfit + LIKE * np.abs(fit.ease - USUAL * tall), np.inf)
     best = int(np.where(trunk.carries(), cost, cost + SHAPED * tall).argmin())
     side, against = fit.shift[best], UPSIDE[0] * (way.up[0] == "-") + UPSIDE[1] * (way.turn > 0)
     shift = np.array([side[0], fit.heights[best] - height, side[1]])
     stays = close and cost[near] < cost[best] + SHAPED / 2 * tall
-    return bool(stays), replace(way, shift=shift, cost=float(cost[best] + against * tall))
+    return fit.farther(near, tall) if stays else None, replace(way, shift=shift, cost=float(cost[best] + against * tall))

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_jax.io.records import BodyRecord
 
-__all__ = ["ANGLES", "RAYS", "Opening", "Trunk", "opening_on", "trunk_of", "upper_opening"]
+__all__ = ["ANGLES", "CENTRED", "RAYS", "SHAPED", "Opening", "Trunk", "opening_on", "trunk_of", "upper_opening"]
 
 ANGLES = 48  # directions in which a section is measured
 STEP = 1 / 300  # of the body's height: distance of the sections
@@ -16,6 +16,10 @@ SPAN = 0.25, 0.9  # of the body's height: they are looked for between
 LEVEL = 0.3  # of its width: an opening that rises by more is not horizontal
 BELOW = 1 / 20  # of the trunk's height: so far below it is wider where it carries
 SLIT = 0.25  # of the longest opening: a shorter one is a buttonhole
+EASE = -0.002, 0.02  # of the body's height: the waist of what hangs is wider than the trunk on all sides by between these,
+SHAPED, CENTRED = 0.004, 0.006  # and so far, at most, are its shape from the trunk's and, if it stays, its middle from there
+USUAL, LIKE = 0.006, 0.25  # of the body's height: it is most often wider by this, and how much less that counts than its shape
+APART, EQUAL = 0.012, 0.00075  # of the body's height: another place is so far off, and fits as well up to so much more misfit
 
 _ANGLE = 2 * np.pi * np.arange(ANGLES) / ANGLES
 RAYS = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)  # x and z
@@ -42,6 +46,23 @@ class Opening(NamedTuple):
     ease: np.ndarray
     misfit: np.ndarray
     shift: np.ndarray
+
+    def cost(self, tall: float) -> np.ndarray:
+        """Return how badly it fits around each section (H,), m, once it is centred there; infinite where it does not."""
+        fits = (self.ease > EASE[0] * tall) & (self.ease < EASE[1] * tall) & (self.misfit < SHAPED * tall)
+        return np.where(fits, self.misfit + LIKE * np.abs(self.ease - USUAL * tall), np.inf)
+
+    def farther(self, near: int, tall: float) -> float:
+        """Return how much farther up than the section `near` it fits as well or better straight above or below, m; 0: nowhere.
+
+        What stays in line must be centred there as it is: the shift counts as misfit.
+        """
+        off = np.linalg.norm(self.shift, axis=1)
+        cost = self.cost(tall) - self.misfit + np.hypot(self.misfit, off)
+        up = self.heights - self.heights[near]
+        there = np.where((np.abs(up) > APART * tall) & (off < CENTRED * tall), cost, np.inf)
+        other = int(there.argmin())
+        return float(up[other]) if there[other] < cost[near] + EQUAL * tall else 0.0
 
 
 def trunk_of(body: BodyRecord) -> Trunk:

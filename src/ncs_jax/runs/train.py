@@ -60,7 +60,7 @@ def train(
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
         report: called after every chunk of steps; KeyboardInterrupt from it ends the run with a checkpoint of these steps.
         say: called with what is done next, in words, before the first step.
-        terms: of one's own, see `energies.terms.OwnTerm`. network: (scene, model) -> one's own, see `network.methods.method.Method`.
+        terms, network: of one's own, see `energies.terms.OwnTerm`, `network.methods.method.Method`: (scene, model) -> network.
 
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 

@@ -15,7 +15,7 @@ from ncs_jax.io.mesh.obj import read_obj
 from ncs_jax.io.mesh.ply import read_ply
 from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.mesh.stl import read_stl
-from ncs_jax.io.mesh.surface import check_surface
+from ncs_jax.io.mesh.surface import check_surface, oriented
 from ncs_jax.io.mesh.usd import USD, read_usd_mesh
 from ncs_jax.io.mesh.weld import weld as same_places
 from ncs_jax.io.packaged import resolved
@@ -35,7 +35,13 @@ FORMATS = (".npz", ".ply", ".stl", *OBJECTS)
 
 
 def read_garment(
-    path: str | Path, *, scale: float = 0.0, up: str = "", weld: float = 0.0, mesh: Sequence[str] = ()
+    path: str | Path,
+    *,
+    scale: float = 0.0,
+    up: str = "",
+    weld: float = 0.0,
+    mesh: Sequence[str] = (),
+    turn_faces: bool = False,
 ) -> GarmentRecord:
     """Read a garment in its rest shape on the resting body, in metres and Y up.
 
@@ -49,12 +55,13 @@ def read_garment(
         path: the file, or ncs:NAME. scale: metres a unit of the file; 0: as the file says, else 1 (USD and FBX say it, glTF is
             in metres). up: the axis that is up in the file, "x", "y" or "z"; empty: as the file says, else "y". weld: vertices
             within this distance of each other are merged, m, see `weld`; 0: none are. mesh: names of the objects, meshes or
-            materials that are the garment, where the file holds several objects (.obj, glTF, FBX, USD).
+            materials that are the garment, where the file holds several objects (.obj, glTF, FBX, USD). turn_faces: turn
+            triangles that face the other side than their neighbours, see `oriented`, and say so in the notes.
 
     Raises:
         InputError: the file cannot be read, or holds several objects and none is named; or the mesh is empty, has a corner that
             does not exist, a number that is not finite, a triangle with a vertex twice, an edge of more than two triangles,
-            neighbours that face opposite sides, or a vertex in no triangle.
+            neighbours that face opposite sides (with turn_faces: a surface of one side), or a vertex in no triangle.
     """
     raw = _raw(resolved(path), (mesh,) if isinstance(mesh, str) else tuple(mesh))
     file, verts = raw.file, len(raw.vertices)
@@ -66,6 +73,11 @@ def read_garment(
     if (weld > 0 or raw.splits) and verts:
         kept, number = same_places(file, x, faces, weld)
         x, faces = x[kept], number[faces].astype(np.int32)
+    notes = raw.notes
+    if turn_faces:
+        faces, turned = oriented(file, x, faces)
+        told = f"{len(turned)} of {len(faces)} triangles faced the other side than their neighbours, the first is face "
+        notes = (*notes, told + f"{turned[0]}: they were turned") if len(turned) else notes
     check_surface(file, faces, len(x))
     uv, weights = raw.uv, raw.weights
     if uv is not None and uv.ndim == 2:  # of the vertices
@@ -76,7 +88,7 @@ def read_garment(
         weights = normalised_weights(file, WEIGHTS, floats(file, WEIGHTS, weights, (verts, "J"), ("vertex", "joint")))[kept]
     sets = {n: number[indices(file, GROUP + n, a, ("N",), verts, "vertices")] for n, a in raw.groups.items()}
     sets = {n: np.unique(a).astype(np.int32) for n, a in sets.items()}
-    return GarmentRecord(x, faces, uv, sets, unit, axis, verts - len(x), weights, raw.joint_names, raw.notes)
+    return GarmentRecord(x, faces, uv, sets, unit, axis, verts - len(x), weights, raw.joint_names, notes)
 
 
 def _raw(path: str | Path, mesh: tuple[str, ...]) -> RawGarment:

@@ -8,7 +8,9 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 
-__all__ = ["boundary_loops", "check_surface"]
+__all__ = ["boundary_loops", "check_surface", "oriented"]
+
+CLEAR = 0.75  # so large a share of a component's triangles tells its side; else its outside does
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
@@ -75,13 +77,67 @@ def _manifold(file: Path, half: np.ndarray, owner: np.ndarray, count: int) -> No
 
 
 def _oriented(file: Path, half: np.ndarray, owner: np.ndarray, count: int) -> None:
+    one, other = _against(half, count)
+    if len(one):
+        a, b = half[one[0]].tolist()
+        raise InputError(
+            f"neighbouring triangles facing the same side expected: both run from vertex {a} to {b}", file=file, field="faces",
+            value=f"faces {owner[one[0]]} and {owner[other[0]]}",
+            mend="recalculate normals, so that all faces look outward, or let `ncs fit` turn them and take what it writes",
+        )  # fmt: skip
+
+
+def _against(half: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of half-edges (N,), (N,) that run the same way along one edge: their triangles face opposite sides."""
     directed = half[:, 0] * count + half[:, 1]
     order = np.argsort(directed, kind="stable")
     twice = np.flatnonzero(np.diff(directed[order]) == 0)
-    if len(twice):
-        one, other = order[twice[0]], order[twice[0] + 1]
-        a, b = half[one].tolist()
+    return order[twice], order[twice + 1]
+
+
+def oriented(file: Path, x: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles (F, 3), turned so that neighbours face the same side, and the numbers of those that were turned.
+
+    A connected component in which all agree stays as it is. Else it faces the side of most of its triangles, or, where less
+    than `CLEAR` of them agree, outward: the sum of area times n . (c - middle), c the triangles' centres, is positive. A turned
+    triangle (a, b, c) becomes (a, c, b). What is no manifold is left as it is, for `check_surface` to refuse.
+
+    Args:
+        file: for errors. x: vertices (V, 3), m.
+
+    Raises:
+        InputError: a component has one side only, as a Moebius strip has.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    total, half = len(faces), faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    edge = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
+    if total == 0 or edge[2].max() > 2:
+        return faces, np.zeros(0, int)
+    order = np.argsort(edge[1].reshape(-1), kind="stable")
+    first = np.flatnonzero(np.diff(edge[1].reshape(-1)[order]) == 0)
+    one, other = order[first], order[first + 1]
+    against = half[one, 0] == half[other, 0]
+    a, b = one // 3, other // 3
+    # every triangle is there twice, as it is and turned: neighbours that face the same side are joined
+    joined = np.concatenate([a, a + total]), np.concatenate([b + total * against, b + total * ~against])
+    graph = coo_array((np.ones(2 * len(a), bool), joined), shape=(2 * total, 2 * total))
+    own, turned = np.split(connected_components(graph, directed=False)[1], 2)
+    same = np.flatnonzero(own == turned)
+    if len(same):
         raise InputError(
-            f"neighbouring triangles facing the same side expected: both run from vertex {a} to {b}", file=file, field="faces",
-            value=f"faces {owner[one]} and {owner[other]}", mend="recalculate normals, so that all faces look outward",
+            "a surface with two sides expected: one side runs over into the other, as on a Moebius strip", file=file,
+            field="faces", value=f"{len(same)} triangles that hang together, the first is face {same[0]}",
+            mend="cut it open along a seam where it is twisted, or turn one end",
         )  # fmt: skip
+    count = np.bincount(own, minlength=2 * total)
+    share = count[own] / (count[own] + count[turned])
+    flip = (share < 0.5) | ((share == 0.5) & (own > turned))
+    for label in np.unique(np.minimum(own, turned)[(share > 1 - CLEAR) & (share < CLEAR)]):
+        part = np.flatnonzero(np.minimum(own, turned) == label)
+        corners = x[np.where(flip[part, None], faces[part][:, [0, 2, 1]], faces[part])].astype(np.float64)
+        corners -= corners.mean(axis=(0, 1))
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flip[part] ^= np.einsum("ti,ti->", area, corners.mean(axis=1)) < 0
+    return np.where(flip[:, None], faces[:, [0, 2, 1]], faces), np.flatnonzero(flip)

@@ -1,0 +1,60 @@
+"""A garment's place on a body, how it lies there, and what speaks against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.errors import InputError
+from ncs_jax.io.records import GarmentRecord
+
+__all__ = ["Placement"]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A garment brought to where it lies best, and how well it lies there.
+
+    garment: in metres and Y up at its place. scale, up, turn: metres a unit of the file, the axis that is up in it, and the
+    turn about the vertical after it, degrees. mirrored: left and right were exchanged. shift (3,): how it was moved then, m.
+    lying, inside: shares of its area on the skin, and inside the body. pierced: joints whose bones pass through the cloth.
+    threaded: share of its openings, by length, that the body passes through. doubt: what speaks against it; empty: nothing.
+    warning: what is left uncertain in a place that is accepted.
+    """
+
+    garment: GarmentRecord
+    scale: float
+    up: str
+    turn: int
+    mirrored: bool
+    shift: np.ndarray
+    lying: float
+    inside: float
+    pierced: tuple[str, ...]
+    threaded: float
+    doubt: str = ""
+    warning: str = ""
+
+    @property
+    def worn(self) -> bool:
+        """Tell whether the body passes through all openings, no bone through the cloth, and next to nothing is inside."""
+        return not self.pierced and self.threaded > 0.99 and self.inside < 0.01
+
+    @property
+    def options(self) -> str:
+        """Return the options of `ncs fit` that bring it exactly here."""
+        x, y, z = self.shift
+        turn = f" --turn {self.turn}" if self.turn else ""
+        return f"--scale {self.scale:g} --up={self.up}{turn} --move {x:.3f} {y:.3f} {z:.3f}"
+
+    def check(self, file: str | Path) -> None:
+        """Raise an InputError where the place is in doubt."""
+        if self.doubt:
+            other = "if it was made for another body, name that by --from; " if self.pierced or self.threaded <= 0.99 else ""
+            raise InputError(
+                f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
+                value=f"as its best place {self.options}", mend=f"{other}if the picture is right, give these options; "
+                "else others of --scale, --up, --turn and --move, or --stay",
+            )  # fmt: skip
