@@ -56,9 +56,8 @@ def _say_bare(quantities: dict[str, float], thickness: float) -> None:
         return
     deepest = max(quantities["depth_max"], quantities["middle_depth_max"])
     frames = f"{quantities['bare']:.0f} of {quantities['measured']:.0f} frames that were measured"
-    print(
-        f"  skin shows in {frames}, most in frame {quantities['barest']:.0f}, {deepest:.1f} mm outside the cloth: train longer"
-    )
+    worst = f"{deepest:.1f} mm outside the cloth in frame {quantities['barest']:.0f}"
+    print(f"  skin shows by 1 mm in {frames}, at most {worst}: train longer")
     print(f"  (--resume), on motions like this one, or with physics.collision.thickness above {1000 * thickness:g} mm")
 
 

@@ -23,6 +23,7 @@ __all__ = ["PreviewStep", "preview"]
 ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
+BARE = 1.0  # mm outside the cloth, from which skin is said to show
 MEASURED = 24  # frames, at most, of which strain and penetration are measured
 
 
@@ -49,7 +50,7 @@ def preview(
     The picture and the page come first, the measures last, and the page is then written again with them. Strain and penetration
     are exact, of every n-th frame, so that there are no more than `MEASURED`: `ncs evaluate` measures all, and the energies.
     Keys: strain_mean (%), with a body penetrating (%), depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n;
-    measured, frames. Where skin is outside the cloth: bare, in how many; barest, the worst. Curves need a log and matplotlib.
+    measured, frames. Where skin is 1 mm outside: bare, in how many; barest, the worst. Curves need a log and matplotlib.
 
     Args:
         run: trained.
@@ -115,7 +116,7 @@ def _measured(run: Run, animation: Animation) -> dict[str, float]:
     found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
     if "depth_max" in rows:
         out = np.maximum(rows["depth_max"], rows["middle_depth_max"])
-        found |= {"bare": float((out > 0).sum()), "barest": float(every * out.argmax())} if out.any() else {}
+        found |= {"bare": float((out > BARE).sum()), "barest": float(every * out.argmax())} if out.max() > BARE else {}
     return found
 
 
