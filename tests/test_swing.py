@@ -14,14 +14,15 @@ from ncs_jax import InputError, assemble, load_run, train
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import total
 from ncs_jax.geometry.skinning import blend, skin
-from ncs_jax.network.methods.swing import QUIET, Swing
+from ncs_jax.network.methods.swing import QUIET, Swing, stiffness
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import BEYOND, features_from_records
 from ncs_jax.prepare.setting import with_cell
-from ncs_jax.scene.model import local_rotations, pose_body
+from ncs_jax.runs.pose_stiffness import fitted
+from ncs_jax.scene.model import RitzModes, local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
-from ncs_jax.simulation.ritz_modes import STICK, _slope, _sticking, softest_ritz_modes
+from ncs_jax.simulation.ritz_modes import LOOSE, STICK, _sticking, displacement_slopes, softest_ritz_modes, stiffness_in_pose
 from ncs_jax.training.loss import gradients
 from ncs_jax.training.step import Task, initial_state, windows_of
 
@@ -138,7 +139,7 @@ def test_the_slope_is_that_of_the_garment_as_it_moves(tmp_path):
     """A field u = A x has the gradient A everywhere, of which a flat sheet sees the two columns of its plane."""
     mesh = hanging(tmp_path).model.garment.mesh
     fields = np.random.default_rng(0).normal(size=(3, 3, 2))
-    found = _slope(mesh, np.einsum("ijk,vj->vik", fields, mesh.rest))
+    found = displacement_slopes(mesh, np.einsum("ijk,vj->vik", fields, mesh.rest))
     np.testing.assert_allclose(found, np.einsum("ijk,ijl->kl", fields[:, :2], fields[:, :2]), rtol=1e-6)
 
 
@@ -161,7 +162,7 @@ def test_the_range_of_a_swing_is_that_of_its_training_and_half_as_much_more():
     assembly, _, motion = ready(method="swing")
     model, network = assembly.model, assembly.network
     params, given = initial_state(model, network, 0).params, model.vibrations
-    learned = given.slope - _slope(model.garment.mesh, np.asarray(given.directions))
+    learned = given.slope - displacement_slopes(model.garment.mesh, np.asarray(given.directions))
     q = np.asarray(swings(network, params, model, assembly.track))
     largest = np.sqrt(np.einsum("tk,kl,tl->t", q, learned, q)).max()
     assert 0.85 < BEYOND * largest < 1.01
@@ -267,9 +268,18 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds():
     params["decoder"]["coefficients"]["kernel"] = params["decoder"]["coefficients"]["kernel"] + 0.01
     pairs = jnp.asarray([2, 0, 3, 1], jnp.int32)
     track = replace(assembly.track, swing=swings(network, params, model, assembly.track))
-    others = jnp.concatenate([ends[pairs[:2]], ends[2:]])
+    vibrations = assembly.model.vibrations
+    some = 0.1 * np.random.default_rng(3).standard_normal((len(vibrations.by_pose) - 3, vibrations.by_pose.shape[1]))
+    wide = np.stack([0 * some[0], 0 * some[0] - 1, 0 * some[0] + 1])
+    vibrations = replace(vibrations, by_pose=jnp.asarray(np.vstack([some, wide])))
+    model = replace(model, vibrations=vibrations)
+    stiff = np.moveaxis(stiffness(vibrations, track.static[ends]), -1, 0)
+    assert np.linalg.eigvalsh(stiff).min() > 0 and np.ptp(stiff, axis=0).max() > 1e-3 * float(vibrations.energy)
+    others = jnp.concatenate([ends[pairs[:1]], ends[1:]])
     size = np.linalg.norm(track.swing, axis=1)
-    share = jnp.asarray([0.0, size.max() / max(size[others[1]], QUIET * size.max()), 1.0, 1.0])
+    spec = replace(spec, motion_augmentation=1.0)  # two of four stand still, and of the others' swings the second is enlarged
+    others = jnp.concatenate([ends[pairs[:2]], ends[2:]])
+    share = jnp.asarray([0.0, size.max() / max(size[others[1]], QUIET * size.max()), 0.0, 0.0])
     mass, d = model.material.density * model.garment.mesh.vertex_area, model.vibrations.directions
     moved, swing = jnp.einsum("vik,v,vik->k", d, mass, d), share[:, None] * track.swing[others]
 
@@ -284,16 +294,16 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds():
         y = decoded(params, static(params) + network.dynamic.apply({"params": params["dynamic"]}, swing))
 
         def of_one(sample):
-            m, y, still, q = sample
+            m, y, still, q, k = sample
             blended = blend(m, model.blend)
             body = None if model.body is None else pose_body(model, m)
             frame = StepInputs(1 / model.fps, body=body, vertex_transforms=blended)
             x = skin(blended, model.garment.mesh.rest + y)
             r = jnp.einsum("vik,v,vi->k", d, mass, y - still) / moved - q
-            held = jnp.sum(0.5 * model.fps**2 * moved * r**2 - model.vibrations.energy * q * r)
+            held = jnp.sum(0.5 * model.fps**2 * moved * r**2 - (k @ q) * r)
             return total(x, model.garment, model.material, frame, terms, model.surface) + held
 
-        samples = track.matrices[ends], jnp.moveaxis(y, -1, 0), jnp.moveaxis(still, -1, 0), swing
+        samples = track.matrices[ends], jnp.moveaxis(y, -1, 0), jnp.moveaxis(still, -1, 0), swing, jnp.asarray(stiff)
         return jnp.mean(jax.lax.map(of_one, samples))
 
     terms = network.loss(model.terms)
@@ -305,6 +315,57 @@ def test_the_gradient_is_that_of_the_energy_and_of_what_holds():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * (1 + np.abs(b).max())), found, expected)
 
 
+def test_the_stiffness_in_a_pose_is_of_a_garment_that_gives_way(tmp_path):
+    """Forward: the least energy of all displacements that go so far along the vibrations, by the second derivative itself."""
+    assembly = hanging(tmp_path, 8)
+    model, track, terms = assembly.model, assembly.track, replace(assembly.model.terms, inertia=False)
+    vibrations = softest_ritz_modes(model, track, 3)
+    height = model.garment.mesh.rest[:, 1] / jnp.ptp(model.garment.mesh.rest[:, 1])
+    stretch = 0.05 * jnp.sin(jnp.pi * height[:, None] * jnp.arange(1.0, 4.0)[None])
+    crooked = vibrations.directions.at[:, 1].add(stretch)
+    model = replace(model, vibrations=replace(vibrations, directions=crooked))
+    (x,), _ = jax.jit(simulate)(simulator_from(model), jax.tree.map(lambda a: a[:1], track))
+    rest, size = model.garment.mesh.rest, 3 * len(model.garment.mesh.rest)
+    (blended,) = blends(track.matrices[:1], model.blend)
+    frame = StepInputs(1 / model.fps, vertex_transforms=blended)
+    hessian = jax.jit(jax.hessian(lambda x: total(x.reshape(-1, 3), model.garment, model.material, frame, terms)))(x.ravel())
+    mass = np.repeat(model.material.density * model.garment.mesh.vertex_area, 3)
+    p = np.einsum("vij,vjk->vik", blended[:, :, :3], crooked).reshape(size, 3)
+    b = (mass[:, None] * p) @ np.linalg.inv(p.T @ (mass[:, None] * p))
+    stiff = np.asarray(hessian) + np.diag(LOOSE**2 * mass)
+    expected = np.linalg.inv(b.T @ np.linalg.solve(stiff, b))
+    offsets = np.linalg.solve(blended[:, :, :3], (x - blended[:, :, 3])[..., None])[..., 0] - rest
+    found = stiffness_in_pose(model, track.matrices[0], offsets)
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * abs(expected).max())
+    locked = p.T @ stiff @ p
+    assert np.trace(found) < 0.5 * np.trace(locked)
+
+
+def test_what_is_fitted_is_a_map_of_the_descriptors_and_keeps_to_what_was_found():
+    rng, modes, poses = np.random.default_rng(1), 3, 60
+    d, a = rng.uniform(-1, 1, (poses, 5)), rng.standard_normal((5, 6)) / 3
+
+    def told(by_pose, d):
+        vibrations = RitzModes(jnp.zeros((4, 3, modes)), jnp.asarray(2.0), by_pose=by_pose)
+        return np.moveaxis(stiffness(vibrations, jnp.asarray(d)[:, None]), -1, 0) / 2
+
+    wide = np.stack([np.full(6, 0.1), np.full(6, -9.0), np.full(6, 9.0)])
+    given = told(jnp.asarray(np.vstack([a, wide])), d)
+    by_pose = fitted(d, given)
+    np.testing.assert_allclose(by_pose[:6], np.vstack([a, wide[:1]]), atol=1e-3)
+    np.testing.assert_allclose(told(jnp.asarray(by_pose), d), given, rtol=5e-3, atol=5e-3)
+    bad = np.array(given)
+    bad[3], bad[4] = np.nan, -bad[4]
+    np.testing.assert_allclose(fitted(d, bad)[:5], a, atol=1e-3)
+    assert fitted(d[:9], bad[:9]) is None  # seven are left
+    far = told(jnp.asarray(by_pose), 100 * d)  # what no training has shown is no softer and no stiffer than what it has
+    entries = np.linalg.cholesky(far)
+    diagonal = np.log(entries[:, range(modes), range(modes)])
+    rows = [0, 2, 5]  # of the diagonal
+    assert np.all(diagonal > by_pose[6, rows] - 1e-9) and np.all(diagonal < by_pose[7, rows] + 1e-9)
+    np.testing.assert_array_equal(told(None, d), np.tile(np.eye(modes), (poses, 1, 1)))
+
+
 def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     """Stopped at a checkpoint and resumed is the same as never stopped; the swing makes a difference, and is told."""
     tables = load_scene(write_scene(tmp_path)).to_dict()
@@ -313,9 +374,12 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     tables["garment"]["pins"], tables["physics"]["collision"]["search"] = "pins", "candidates"
     scene, reports = scene_from(tables, source=str(tmp_path / "scene.toml")), []
 
+    for name, number in {"STEPS": 2, "FEWEST": 4}.items():
+        monkeypatch.setattr(f"ncs_jax.runs.pose_stiffness.{name}", number)
     with monkeypatch.context() as patch:
         patch.setattr("ncs_jax.runs.train.IDLE", np.inf)
         made = train(scene, tmp_path / "run", steps=40, report=reports.append)
+    assert np.ptp(made.assembly.model.vibrations.by_pose[-2:], axis=0).max() > 0.01  # the pose tells how stiff it is
     moved = np.mean([r.moved for r in reports])
     assert reports[-1].message == f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {moved:.2g} mm"
     fresh = replace(made, params=initial_state(made.assembly.model, made.assembly.network, 0).params)
@@ -329,11 +393,14 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     resumed = train(scene, tmp_path / "run", resume=True, report=reports.append)
     assert reports[-1].step == 40 and not reports[-1].message  # it moves
     jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
+    np.testing.assert_array_equal(resumed.assembly.model.vibrations.by_pose, made.assembly.model.vibrations.by_pose)
     _refuse_an_earlier_swing(scene, tmp_path / "run")
 
 
 def _refuse_an_earlier_swing(scene, folder):
     """Without a slope it was trained to add its swing to the cloth: it is animated, and neither resumed nor begun from."""
+    for made in folder.glob("prepared-*.npz"):
+        made.unlink()
     with np.load(folder / "prepared.npz") as kept:
         arrays = {name: kept[name] for name in kept if name != "slope"}
     np.savez(folder / "prepared.npz", **arrays)

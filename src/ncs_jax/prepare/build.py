@@ -18,6 +18,7 @@ from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.swing import as_about_the_drape
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
@@ -99,7 +100,7 @@ def build(
 
             prepared = _with_vibrations(scene, prepared, model, faces, known, begin)
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
-        model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
+        model = replace(model, vibrations=vibrations_of(prepared, dtype) if prepared.vibrations.size else None)
     network = network_from(scene, model)
     model = model.with_terms(terms) if terms else model
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track)
@@ -153,46 +154,55 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
         modes = softest_ritz_modes(smooth, track, count)
         if modes is None:
             return None
+        modes = replace(modes, by_pose=as_about_the_drape(model, count))
         slope = _range(scene, replace(model, vibrations=modes), track)
-        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope}
+        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope, "by_pose": modes.by_pose}
         return {name: np.asarray(array) for name, array in arrays.items()}
 
-    return replace(prepared, **(kept(("vibrations", "energy", "slope"), found, smooth, track, str(scene.network)) or {}))
+    names = "vibrations", "energy", "slope", "by_pose"
+    return replace(prepared, **(kept(names, found, smooth, track, str(scene.network)) or {}))
 
 
 def _expected(setting: Setting, model: Model, track: MotionFeatures) -> Assembly:
     """Return what a scene becomes whose garment has all the vibrations that it may have: of zeros, as they are not known."""
     scene, basis = setting.scene, model.basis
     count, zeros = scene.network.vibrations, functools.partial(np.zeros, dtype=basis.dtype)
-    modes = RitzModes(*map(jax.device_put, (zeros((len(basis), 3, count)), zeros(()), zeros((count, count)))))
+    shapes = (len(basis), 3, count), (), (count, count), as_about_the_drape(setting.model, count).shape
+    modes = RitzModes(*(jax.device_put(zeros(shape)) for shape in shapes))
     setting = replace(setting, model=replace(model, vibrations=modes))
     return Assembly(**vars(setting), network=network_from(scene, setting.model), training_features=track)
 
 
 def _range(scene: Scene, model: Model, track: MotionFeatures) -> np.ndarray:
+    """Return what bounds a swing of the garment that a fresh network gives, next to that of skinning."""
+    from ncs_jax.training.step import initial_state
+
+    network = network_from(scene, model)  # by the programs that training begins with
+    return swing_range(network, initial_state(model, network, 0).params, model, track)
+
+
+def swing_range(network: Method, params: dict, model: Model, track: MotionFeatures) -> np.ndarray:
     """Return what bounds a swing, S + W (modes, modes): its linear range, and what the training motions show a network of it.
 
         W = C^-1 / (b^2 max_t q_t^T C^-1 q_t),   C = mean q q^T + e tr(mean q q^T) / modes I,   b = BEYOND,   e = LEAST
 
-    q are the training's swings of the garment that a fresh network gives, next to that of skinning. One that is b times as
-    far as any of them has q^T W q = 1, by how far they go in its own direction.
+    q are the training's swings of the network's garment, with the slope S of the model alone. One that is b times as far as
+    any of them has q^T W q = 1, by how far they go in its own direction.
     """
-    from ncs_jax.training.step import initial_state, refreshed
+    from ncs_jax.training.step import refreshed
 
-    network, vibrations = network_from(scene, model), required(model.vibrations, "vibrations")
-    params = initial_state(model, network, 0).params  # by the programs that training begins with
     q = np.asarray(refreshed(network, params, model, track)["swing"], np.float64)
-    spread, slope = q.T @ q / len(q), np.asarray(vibrations.slope, np.float64)
+    spread, slope = q.T @ q / len(q), np.asarray(required(model.vibrations, "vibrations").slope, np.float64)
     if not spread.any():
         return slope
     inverse = np.linalg.inv(spread + LEAST * np.trace(spread) / len(spread) * np.eye(len(spread)))
     return slope + inverse / (BEYOND**2 * np.einsum("tk,kl,tl->t", q, inverse, q).max())
 
 
-def _vibrations(prepared: Prepared, dtype) -> RitzModes:
+def vibrations_of(prepared: Prepared, dtype) -> RitzModes:
     """Return what was prepared of a swing; without slope it is of a run of an earlier version."""
-    slope = jnp.asarray(prepared.slope, dtype) if prepared.slope.size else None
-    return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), slope)
+    slope, by_pose = (jnp.asarray(a, dtype) if a.size else None for a in (prepared.slope, prepared.by_pose))
+    return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), slope, by_pose)
 
 
 def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeatures:

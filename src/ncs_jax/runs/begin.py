@@ -15,12 +15,11 @@ import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
-from ncs_jax.prepare.build import Assembly
+from ncs_jax.prepare.build import Assembly, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
 from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
-from ncs_jax.scene.model import RitzModes
 from ncs_jax.scene.spec import NetworkSpec, Scene, scene_from
 from ncs_jax.training.step import initial_state
 
@@ -49,7 +48,7 @@ def assemble_run(
     if start is not None:
         return _assemble_started(start, scene, network, functools.partial(make_ready, ahead=None))
     assembly = make_ready(scene)
-    if facts is not None and out is not None and facts.get("start"):  # of the run it began from: not found anew
+    if facts is not None and out is not None and (out / "prepared.npz").exists():  # of what it has learned: not found anew
         assembly = _with_fields_of(read_prepared(out), assembly)
     return assembly, None
 
@@ -186,10 +185,9 @@ def _with_fields_of(before: Prepared, assembly: Assembly) -> Assembly:
     model, prepared = assembly.model, replace(assembly.prepared, basis=before.basis)
     model = replace(model, basis=jnp.asarray(before.basis, model.basis.dtype))
     if model.vibrations is not None:
-        found = {"vibrations": before.vibrations, "energy": before.energy, "slope": before.slope}
+        found = {name: getattr(before, name) for name in ("vibrations", "energy", "slope", "by_pose")}
         prepared = replace(prepared, **found)
-        vibrations = RitzModes(*(jnp.asarray(a, model.basis.dtype) for a in found.values()))
-        model = replace(model, vibrations=vibrations)
+        model = replace(model, vibrations=vibrations_of(prepared, model.basis.dtype))
     return replace(assembly, model=model, prepared=prepared)
 
 

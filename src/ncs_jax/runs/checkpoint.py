@@ -2,6 +2,7 @@
 
     RUN/run.json                the scene, the steps planned, the seed, the versions
     RUN/prepared.npz            what was computed from the scene's files: skinning weights, touchable part, modes
+    RUN/prepared-STEP.npz       the same with what training found of the garment at a step: its stiffness by pose
     RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
     RUN/log.csv                 one row a report
 
@@ -84,22 +85,24 @@ def read_run(run: Path) -> dict:
     return facts
 
 
-def write_prepared(run: Path, prepared: Prepared) -> None:
-    """Write RUN/prepared.npz atomically."""
+def write_prepared(run: Path, prepared: Prepared, step: int = 0) -> None:
+    """Write RUN/prepared.npz atomically, or what training has made of it at a step, RUN/prepared-STEP.npz."""
     temporary = run / "prepared.part.npz"
     np.savez_compressed(temporary, **vars(prepared))
-    os.replace(temporary, run / "prepared.npz")
+    os.replace(temporary, run / (f"prepared-{step}.npz" if step else "prepared.npz"))
 
 
 def read_prepared(run: Path) -> Prepared:
-    """Read RUN/prepared.npz.
+    """Read RUN/prepared.npz, or what training had made of it at the newest checkpoint.
 
     Raises:
         InputError: it is missing or damaged.
     """
     fields = dataclasses.fields(Prepared)
     names = [f.name for f in fields]
-    path = Path(run) / "prepared.npz"
+    made = {int(p.stem.removeprefix("prepared-")): p for p in Path(run).glob("prepared-*.npz")}
+    latest = Checkpoints(Path(run)).latest() if made else None
+    path = max((step, p) for step, p in {0: Path(run) / "prepared.npz", **made}.items() if step <= (latest or 0))[1]
     try:
         table = read_npz(path, names.__contains__)
         first = [f.name for f in fields if f.default_factory is dataclasses.MISSING]  # of a run of an earlier version

@@ -17,6 +17,7 @@ from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.network.methods.method import Method
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import Assembly
+from ncs_jax.runs.pose_stiffness import learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.training.batches import batches
@@ -96,6 +97,16 @@ class PlacedScene:
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
+
+    def learn_pose_stiffness(self, params: dict, steps: int) -> bool:
+        """Find how stiff the garment is in poses, of so many steps: see `runs.pose_stiffness`. Return whether it is known."""
+        learned = learn_pose_stiffness(self.assembly, params, self.assembly.track, steps, self.seed)
+        if learned is self.assembly:
+            return False
+        self.assembly, self.model = learned, replace(self.model, vibrations=learned.model.vibrations)
+        self._everywhere = self.copied(self.model), self._everywhere[1]
+        self.refresh(params)
+        return True
 
     def rebuild_lists(self, params: dict) -> None:
         """Tell the search for the nearest vertex where the garment is now: it finds the same, several times as fast."""

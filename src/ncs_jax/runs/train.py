@@ -19,6 +19,7 @@ import numpy as np
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.metrics.quality import summarise
+from ncs_jax.prepare.build import Assembly
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
@@ -96,7 +97,7 @@ def train(
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
         last = _planned(placed, output, state, steps, minutes)
-        return Run(assembly, _Loop(placed, output, placed.copied(state), last, began).run(), last)
+        return _Loop(placed, output, placed.copied(state), last, began).run()
 
 
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
@@ -173,6 +174,11 @@ class _Output:
         if self._out is not None:
             self._log = RunLog(self._out, first)
 
+    def keep(self, step: int, assembly: Assembly) -> None:
+        """Write what training has found out of the garment at a step."""
+        if self._out is not None:
+            write_prepared(self._out, assembly.prepared, step)
+
     def tell(self, entry: Report) -> None:
         """Log a report and hand it to whoever wants it."""
         if self._log is not None:
@@ -204,8 +210,8 @@ class _Loop:
         self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
         self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
 
-    def run(self) -> dict:
-        """Take every step that is left, and return the parameters."""
+    def run(self) -> Run:
+        """Take every step that is left, and return the trained garment."""
         placed = self._placed
         placed.refresh(placed.local(self._state.params))
         if self._first:
@@ -213,13 +219,15 @@ class _Loop:
         self._output.begin_log(self._first)
         for at, count in chunks(self._first, self._steps):
             self._take(at, count)
-        return placed.local(self._state.params)
+        return Run(placed.assembly, placed.local(self._state.params), self._steps)
 
     def _take(self, at: int, count: int) -> None:
         """Take the steps at to at + count, report them, and keep a checkpoint where one is due."""
         placed, done = self._placed, at + count
         self._state, logs = placed.run_chunk(self._state, at, count, self._steps)
         here, logs = placed.local((self._state, logs))
+        if done in (whole_chunks(self._steps // 2), self._steps) and placed.learn_pose_stiffness(here.params, self._steps):
+            self._output.keep(done, placed.assembly)
         if self._timed is None:  # this chunk was compiled
             trim_memory()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}

@@ -29,12 +29,14 @@ class RitzModes:
     directions: displacements (verts, 3, modes), m. energy: twice what moving by one of them takes, the same for all, J.
     slope: what bounds a swing q, by q^T slope q: the garment's mean of the displacement gradients' products, grad d_k : grad
     d_l, of which the root is how much it turns and strains, r.m.s.; and what training shows of it, see `methods.swing`. None
-    in a run of an earlier version, whose swing has no bounds.
+    in a run of an earlier version, whose swing has no bounds. by_pose: how stiff the garment is along them in a pose, a linear
+    map of its descriptors, its constant, and between what it was seen, see `runs.pose_stiffness`; None: as about the drape.
     """
 
     directions: Float[Array, "verts 3 modes"]
     energy: Float[Array, ""]
     slope: Float[Array, "modes modes"] | None = None
+    by_pose: Float[Array, "rows entries"] | None = None
 
 
 @jax.tree_util.register_dataclass

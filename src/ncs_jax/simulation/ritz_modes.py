@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ncs_jax.errors import required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.numerics import normalize
@@ -30,19 +31,19 @@ from ncs_jax.simulation.solver.problem import (
 )
 from ncs_jax.simulation.solver.stiffness import couplings_from
 
-__all__ = ["softest_ritz_modes"]
+__all__ = ["displacement_slopes", "softest_ritz_modes", "stiffness_in_pose"]
 
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
 FALL = 5  # steps without friction, until the garment touches the body
 STEPS = 60  # of Newton's method to the drape, at most
 STILL = {np.dtype(np.float32): 1e-3, np.dtype(np.float64): 1e-5}  # m, r.m.s.: a Newton step this short ends the search
 STICK = 30.0  # rad/s: of a vertex that is held on the body: under its own weight it slips by g / STICK^2, 11 mm
+LOOSE = 1.0  # rad/s: of what nothing holds in a pose, such as a fold that slips
 LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
-def _still(model: Model, track: MotionFeatures) -> tuple[Problem, Array]:
-    """The garment in a track's first frame, seen from the root joint, which no past moves; and its skinning transforms."""
-    matrices = track.matrices[0]
+def _still(model: Model, matrices: Array) -> tuple[Problem, Array]:
+    """The garment in a pose, seen from the root joint, which no past moves; and its skinning transforms."""
     matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
     model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
     transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
@@ -95,6 +96,14 @@ def _matrix(problem: Problem, diagonal, off):
     return (matrix + matrix.T) / 2
 
 
+def _stiff(problem: Problem, blocks, mass):
+    """The stiffness of a place, sparse, without the mass that `stiffness_blocks` adds."""
+    from scipy.sparse import diags
+
+    added = mass / max(1 / problem.model.fps, float(static_step(problem.model))) ** 2
+    return _matrix(problem, *(np.asarray(block, np.float64) for block in blocks)) - diags(np.repeat(added, 3))
+
+
 def _solved(matrix, right):
     """The solution of a positive definite system."""
     from scipy.sparse.linalg import splu
@@ -112,7 +121,6 @@ def _drape(problem: Problem, x, mass):
     from scipy.sparse import diags
 
     least = float(static_step(problem.model))
-    added = mass / max(1 / problem.model.fps, least) ** 2  # by `blocks`
     held, at, h = jnp.zeros((*x.shape, 3), x.dtype), x, least
     known = _evaluated(problem, x, held, at)
     for count in range(STEPS):
@@ -120,7 +128,7 @@ def _drape(problem: Problem, x, mass):
             held, at = _sticking(problem, known[1]), x
             known = _evaluated(problem, x, held, at)
         _, point, found = known
-        stiff = _matrix(problem, *(np.asarray(block, np.float64) for block in found)) - diags(np.repeat(added, 3))
+        stiff = _stiff(problem, found, mass)
         p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
         step = np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum())
         if count > FALL and step < STILL[x.dtype]:
@@ -160,7 +168,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     from scipy.linalg import eigh
     from scipy.sparse import diags
 
-    problem, transforms = _still(model, track)
+    problem, transforms = _still(model, track.matrices[0])
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
     held = np.asarray(model.garment.pins) if model.terms.pinning else ()
@@ -184,11 +192,40 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     directions = np.linalg.solve(
         np.asarray(transforms, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
     )
-    dtype = model.basis.dtype
-    return RitzModes(jnp.asarray(directions, dtype), jnp.asarray(energy, dtype), jnp.asarray(_slope(mesh, directions), dtype))
+    slopes = displacement_slopes(mesh, directions)
+    return RitzModes(*(jnp.asarray(array, model.basis.dtype) for array in (directions, energy, slopes)))
 
 
-def _slope(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
+def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarray:
+    """Return how a garment in a pose opposes a displacement along its vibrations when all else of it gives way, J.
+
+        K = (B^T H^-1 B)^-1,   B = M P G^-1,   G = P^T M P,   P = R D
+
+    H is the stiffness there, as Newton's method has it, with what touches the body stuck to it where nothing is pinned. A load
+    f on the vibrations moves the garment by y = H^-1 B f, and so by q = B^T y along them: f = K q. P^T H P in its place would
+    be stiffer by far: the drape's vibrations stretch the cloth in other poses.
+
+    Args:
+        model: with vibrations D. matrices: joint transforms (joints, 3, 4). offsets: (verts, 3) of the static garment, m.
+    """
+    from scipy.sparse import diags
+
+    problem, transforms = _still(model, matrices)
+    x = skin(transforms, model.garment.mesh.rest + offsets)
+    free = jnp.zeros((*x.shape, 3), x.dtype)
+    _, point, (diagonal, off) = _evaluated(problem, x, free, x)
+    mass = np.asarray(problem.mass, np.float64)
+    mass = np.where(mass > 0, mass, mass.mean())
+    directions = required(model.vibrations, "model.vibrations").directions
+    p = np.einsum("vij,vjk->vik", np.asarray(transforms, np.float64)[..., :3], np.asarray(directions, np.float64))
+    p = p.reshape(-1, p.shape[-1])
+    moved = np.repeat(mass, 3)[:, None] * p
+    b = np.linalg.solve(p.T @ moved, moved.T).T
+    stiff = _stiff(problem, (diagonal + _sticking(problem, point), off), mass) + diags(np.repeat(LOOSE**2 * mass, 3))
+    return np.linalg.inv(b.T @ _solved(stiff, b))
+
+
+def displacement_slopes(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     """Return the mean over the garment of grad d_k : grad d_l (modes, modes), gradients in the plane of the rest state."""
     corner = directions[np.asarray(mesh.faces)]
     edges = np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=2)

@@ -92,11 +92,12 @@ def windows_of(task: Task, ends, pairs) -> Windows:
     """Return the windows of a step that end at frames `ends`, augmented by those that `pairs` names, both (batch,)."""
     spec, axis = task.spec, task.axis
     history = 3 if task.network.loss(task.model.terms).inertia else 1
-    augmented = round(spec.motion_augmentation * spec.batch) if task.network.controlled else 0
+    moved = spec.batch - round(task.network.still * spec.batch)
+    augmented = round(spec.motion_augmentation * moved) if task.network.controlled else 0
     number = jnp.arange(ends.shape[0], dtype=ends.dtype)
     if axis is not None:
         number = number + lax.axis_index(axis) * ends.shape[0]
-    return Windows(ends, pairs, number, augmented, spec.window, history, axis)
+    return Windows(ends, pairs, number, augmented, spec.window, history, axis, moved)
 
 
 def step(task: Task, steps, state: TrainState, track: MotionFeatures, indices) -> tuple[TrainState, dict]:

@@ -59,7 +59,7 @@ class Windows:
     ends: last frames (batch,). others: which window of the whole batch moves an augmented one (batch,). number: each window's
     place in the whole batch. augmented: so many of the whole batch, the first ones, are moved by another window (motion
     augmentation). length: frames that a window looks back at. history: frames that inertia needs, 3, or 1 without it.
-    axis: of the devices that share the batch, None on one.
+    axis: of the devices that share the batch, None on one. still: from this place on, nothing moves a window.
     """
 
     ends: Int[Array, "batch"]
@@ -69,6 +69,7 @@ class Windows:
     length: int
     history: int
     axis: str | None = None
+    still: int | None = None
 
     @property
     def own(self) -> Array:
@@ -81,6 +82,7 @@ class Kept(NamedTuple):
 
     codes: Array  # z of the last `history` frames (history, batch, code)
     swing: Array | None = None  # q of the last frames (batch, modes)
+    force: Array | None = None  # what the garment opposes to it (batch, modes), J
 
 
 class Offsets(NamedTuple):
@@ -121,6 +123,10 @@ class Method(Protocol):
     @property
     def refreshes(self) -> bool:
         """Return whether `refresh` changes anything; where it is False, nobody compiles or calls it."""
+
+    @property
+    def still(self) -> float:
+        """Return the share of a batch whose windows nothing moves, so that the static part is trained by itself too."""
 
     def code_size(self, model: Model) -> int:
         """Return how many numbers a code has."""
@@ -239,7 +245,7 @@ def decode(
 class FromCodes:
     """What methods share that train on nothing but the codes of their windows: nothing couples, and nothing is refreshed."""
 
-    refreshes = False
+    refreshes, still = False, 0.0
 
     def offsets(self: Method, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
         """Return the offsets of windows whose codes come from `self.windows`: those that the loss differentiates.

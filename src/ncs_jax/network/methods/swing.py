@@ -3,7 +3,11 @@
 The swing q is what implicit Euler makes of the energy linearised about the static garment s_t that the network gives, along
 the directions D of `ritz_modes.softest_ritz_modes`, carried by skinning, P_t = R_t D:
 
-    (G_t (1 + c h) + h^2 E_0) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
+    (G_t (1 + c h) + h^2 K_t) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
+
+K_t is the stiffness of the pose: what a displacement along the vibrations costs when all else of the garment gives way, see
+`ritz_modes.stiffness_in_pose`. Training finds it about the garment that it has learned, in some poses, and fits it to all by a
+linear map of the descriptors: `stiffness`. Until then it is that about the drape, E_0 I.
 
 and, where that is beyond the linear range, stops short of it, see `Swing.bounded`. It begins at zero, rings with the garment's
 own periods, and decays; nothing of it is learned. What is learned is how the cloth goes along with a swing:
@@ -44,7 +48,7 @@ from ncs_jax.network.methods.method import (
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes, pose_garment
 
-__all__ = ["Swing"]
+__all__ = ["Swing", "as_about_the_drape", "stiffness"]
 
 BLOCK = 32  # frames whose statics are posed together
 FEW = 8  # poses of which sums are faster as a product of matrices: ten times of one, but half as fast of 32
@@ -70,6 +74,7 @@ class Swing:
     learn_weights: bool = False
     controlled = True
     refreshes = True
+    still = 0.5
 
     @property
     def state(self) -> int:
@@ -107,8 +112,8 @@ class Swing:
         s, p = self._static_garment(params, model, fixed.reshape(-1, fixed.shape[-1]), matrices.at[:, :, 3].add(-now[None]))
         previous, before = jnp.where(started[None, None] > 0, earlier.reshape(2, *s.shape) + (root - now)[None, None], s[None])
         g, push = _product(model, p, p), _push(model, p, s - 2 * previous + before)
-        h = 1 / model.fps
-        q = self.bounded(model, _times(_inverse(self._stiff(model, g)), self.damping * h * _times(g, q) - push))
+        h, k = 1 / model.fps, stiffness(_vibrations(model), static.reshape(-1, *static.shape[-2:]))
+        q = self.bounded(model, _times(_inverse(self._system(model, g, k)), self.damping * h * _times(g, q) - push))
         x = s + jnp.sum(p * q[None, None], axis=2)
         new = jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in (x, previous, now, q, jnp.ones_like(started))])
         q = q.T.reshape(*shape, self.modes)
@@ -132,7 +137,7 @@ class Swing:
         seen = np.clip(np.arange(0, frames, block)[:, None] + np.arange(-2, block), 0, frames - 1)
 
         def sums(args):
-            z, matrices, number, start = args
+            z, matrices, number, start, static = args
             s, p = self._static_garment(params, model, z, jnp.moveaxis(matrices, 0, -1))
             (s, s1, s2), (p, p1, p2) = ([a[..., 2 - k : block + 2 - k] for k in range(3)] for a in (s, p))
             one, two = ((number[2:] - k >= start[2:])[None, None] for k in (1, 2))
@@ -140,10 +145,10 @@ class Swing:
             p1, p2 = jnp.where(one[None], p1, 0), jnp.where(two[None], p2, 0)
             found = _product(model, p, p), _product(model, p, p1), _product(model, p, p2), _push(model, p, s - 2 * s1 + s2)
             *products, push = found
-            inverse = _inverse(self._stiff(model, products[0]))
+            inverse = _inverse(self._system(model, products[0], stiffness(_vibrations(model), static)))
             return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (inverse, *products, push))
 
-        some = lax.map(sums, (z[seen], track.matrices[seen], number[seen], track.start[seen]))
+        some = lax.map(sums, (z[seen], track.matrices[seen], number[seen], track.start[seen], track.static[seen[:, 2:]]))
         inverse, g, g1, g2, push = (a.reshape(-1, *a.shape[2:])[:frames] for a in some)
 
         def step(swing, frame):
@@ -190,17 +195,19 @@ class Swing:
         at = jnp.where(windows.own, ends, others[windows.others])
         share = windows.number.astype(swing.dtype) / max(windows.augmented - 1, 1)
         share = jnp.where(windows.own, 1, share * self.enlargement(track, at))
+        share = jnp.where(windows.number < required(windows.still, "windows.still"), share, 0)
         q = share[:, None] * swing[at]
         codes = Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
         z = codes.together()
         offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
         offsets, static = jnp.split(offsets, 2, axis=-1)
         moved = offsets - lax.stop_gradient(static)
-        return Offsets([offsets], moved), Kept(z[None], q)
+        force = jnp.sum(stiffness(_vibrations(model), track.static[ends]) * q.T[None], axis=1).T
+        return Offsets([offsets], moved), Kept(z[None], q, force)
 
     def coupling(self, model: Model, extra: Array, kept: Kept) -> tuple[dict[str, Array], Array]:
         """Return the energy `hold` of what the dynamic code adds to the offsets, and its derivative."""
-        value, gradient = self.hold(model, extra, required(kept.swing, "kept.swing"))
+        value, gradient = self.hold(model, extra, required(kept.swing, "kept.swing"), required(kept.force, "kept.force"))
         return {"hold": value}, gradient
 
     def enlargement(self, track: MotionFeatures, frames: Int[Array, "batch"]) -> Float[Array, "batch"]:
@@ -213,17 +220,21 @@ class Swing:
         return largest / jnp.maximum(jnp.maximum(size[frames], QUIET * largest), jnp.finfo(size.dtype).tiny)
 
     def hold(
-        self, model: Model, moved: Float[Array, "verts 3 batch"], swing: Float[Array, "batch modes"]
+        self,
+        model: Model,
+        moved: Float[Array, "verts 3 batch"],
+        swing: Float[Array, "batch modes"],
+        force: Float[Array, "batch modes"],
     ) -> tuple[Float[Array, "batch"], Array]:
         """Return the inertia of the swing q, which carries it on where the energy pulls it back, and its derivative.
 
-            sum_i g_i r_i^2 / (2 h^2) - E_0 q_i r_i,   r_i = d_i^T M y / g_i - q_i,   g_i = d_i^T M d_i
+            sum_i g_i r_i^2 / (2 h^2) - (K q)_i r_i,   r_i = d_i^T M y / g_i - q_i,   g_i = d_i^T M d_i
 
         It is how inertia changes as the garment moves by r beyond q along the vibrations, for the q that implicit Euler gives.
         Only what the linearised energy does not know of moves it then: the body, above all.
 
         Args:
-            moved: y, what the dynamic code adds to the offsets, m.
+            moved: y, what the dynamic code adds to the offsets, m. swing: q. force: K q, J.
         """
         vibrations, mass = _vibrations(model), _mass(model)
         d = vibrations.directions
@@ -231,8 +242,8 @@ class Swing:
         g = jnp.sum(along * d.reshape(along.shape), axis=0)
         along = along / g[None]
         r = _matmul(along.T, moved.reshape(len(along), -1)) - swing.T
-        inertia, force = (g * model.fps**2)[:, None] * r, vibrations.energy * swing.T
-        return jnp.sum(r * (inertia / 2 - force), axis=0), _matmul(along, inertia - force).reshape(moved.shape)
+        inertia = (g * model.fps**2)[:, None] * r
+        return jnp.sum(r * (inertia / 2 - force.T), axis=0), _matmul(along, inertia - force.T).reshape(moved.shape)
 
     def _static_garment(self, params, model, z, matrices):
         """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
@@ -243,16 +254,38 @@ class Swing:
         p = sum(transforms[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
         return pose_garment(model, offsets, matrices, weights), p
 
-    def _stiff(self, model, g):
-        """G (1 + c h) + h^2 E_0, poses last."""
+    def _system(self, model, g, stiff):
+        """G (1 + c h) + h^2 K, poses last."""
         h = 1 / model.fps
-        return g * (1 + self.damping * h) + h * h * _vibrations(model).energy * jnp.eye(self.modes, dtype=g.dtype)[..., None]
+        return g * (1 + self.damping * h) + h * h * stiff
 
     def _static(self, params, descriptors):
         return jnp.asarray(self.static.apply({"params": params["static"]}, descriptors))
 
     def _dynamic(self, params, swing):
         return jnp.asarray(self.dynamic.apply({"params": params["dynamic"]}, swing))
+
+
+def as_about_the_drape(model: Model, modes: int) -> Float[Array, "rows entries"]:
+    """Return the zeros (rows, entries) of which `stiffness` makes E_0 I in every pose."""
+    (joints, numbers), _ = descriptor_sizes(model)
+    return jnp.zeros((joints * numbers + 3, modes * (modes + 1) // 2), model.basis.dtype)
+
+
+def stiffness(vibrations: RitzModes, static: Float[Array, "poses joints numbers"]) -> Float[Array, "modes modes poses"]:
+    """Return K of poses by their static descriptors d, J: positive definite, its factor between what training saw.
+
+    K = E_0 C C^T,   C lower triangular, its entries, those of the diagonal as logarithms, clip(A d + a, least, most)
+    """
+    modes = vibrations.directions.shape[-1]
+    if vibrations.by_pose is None:
+        return jnp.broadcast_to(vibrations.energy * jnp.eye(modes, dtype=static.dtype)[..., None], (modes, modes, len(static)))
+    slopes, (constant, least, most) = vibrations.by_pose[:-3], vibrations.by_pose[-3:, :, None]
+    entries = jnp.clip(_matmul(slopes.T, static.reshape(len(static), -1).T) + constant, least, most)
+    row, column = np.tril_indices(modes)
+    entries = jnp.where((row == column)[:, None], jnp.exp(entries), entries)
+    c = jnp.zeros((modes, modes, len(static)), entries.dtype).at[row, column].set(entries)
+    return vibrations.energy * jnp.sum(c[:, None] * c[None], axis=2)
 
 
 def _vibrations(model: Model) -> RitzModes:

@@ -1,0 +1,98 @@
+"""How stiff a garment is along its vibrations in every pose: found in some about what a network has learned, and fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ncs_jax.errors import required
+from ncs_jax.network.methods.method import decode
+from ncs_jax.network.methods.swing import Swing
+from ncs_jax.prepare.build import Assembly, swing_range
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model, RitzModes
+from ncs_jax.simulation.ritz_modes import displacement_slopes, stiffness_in_pose
+
+__all__ = ["learn_pose_stiffness"]
+
+MOST = 128  # poses: by then the map explains 3 quarters of what differs between a skirt's
+FEWEST = 8  # poses that a map is fitted to
+STEPS = 64  # of training for each pose, so that they take about a twentieth of its time
+RIDGES = 10.0 ** np.arange(-4, 3)  # of the mean square of the descriptors
+
+
+def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures, steps: int, seed: int) -> Assembly:
+    """Return a garment whose swing knows how stiff the garment is in a pose, as the network now has the garment.
+
+    K is found by `stiffness_in_pose` in some poses of the training, one in `STEPS` steps, at most `MOST`; its Cholesky factor
+    is fitted by ridge regression on the poses' descriptors, the ridge chosen by leaving each pose out, for
+    `methods.swing.stiffness`. Between what was found in the poses it is bounded. What bounds a swing is found anew with it.
+    A network that does not swing, and a training too short for `FEWEST` poses, leave all as it is.
+    """
+    network, model = assembly.network, assembly.model
+    count = min(MOST, steps // STEPS, len(track.start))
+    if not isinstance(network, Swing) or count < FEWEST or required(model.vibrations, "vibrations").by_pose is None:
+        return assembly
+    frames = np.sort(np.random.default_rng([seed, 2]).permutation(len(track.start))[:count])
+    offsets = np.asarray(_static_offsets(network, params, model, track.static[frames]))
+    found = [stiffness_in_pose(model, track.matrices[t], jnp.asarray(offsets[..., i])) for i, t in enumerate(frames)]
+    vibrations = required(model.vibrations, "model.vibrations")
+    by_pose = fitted(
+        np.asarray(track.static[frames], np.float64).reshape(count, -1), np.array(found) / float(vibrations.energy)
+    )
+    if by_pose is None:
+        return assembly
+    dtype = model.basis.dtype
+    alone = displacement_slopes(model.garment.mesh, np.asarray(vibrations.directions))
+    vibrations = replace(vibrations, by_pose=jnp.asarray(by_pose, dtype), slope=jnp.asarray(alone, dtype))
+    slope = swing_range(network, params, replace(model, vibrations=vibrations), track)
+    return with_vibrations(assembly, replace(vibrations, slope=jnp.asarray(slope, dtype)))
+
+
+def with_vibrations(assembly: Assembly, vibrations: RitzModes) -> Assembly:
+    """Return the garment with these vibrations, and what is kept with its run."""
+    kept = {"slope": np.asarray(vibrations.slope), "by_pose": np.asarray(vibrations.by_pose)}
+    return replace(
+        assembly,
+        model=replace(assembly.model, vibrations=vibrations),
+        prepared=replace(assembly.prepared, **kept),
+    )
+
+
+def fitted(
+    descriptors: Float[np.ndarray, "poses numbers"], stiffness: Float[np.ndarray, "poses modes modes"]
+) -> Float[np.ndarray, "rows entries"] | None:
+    """Return the map of `RitzModes.by_pose` that ridge regression gives; None where no `FEWEST` of them are definite."""
+    good = np.isfinite(stiffness).all(axis=(1, 2))
+    good[good] = np.linalg.eigvalsh(stiffness[good])[:, 0] > 0
+    if good.sum() < FEWEST:
+        return None
+    row, column = np.tril_indices(stiffness.shape[1])
+    factor = np.linalg.cholesky(stiffness[good])[:, row, column]
+    entries = np.where(row == column, np.log(np.where(row == column, factor, 1)), factor)
+    d, y = descriptors[good], entries - entries.mean(axis=0)
+    middle = d.mean(axis=0)
+    d = d - middle
+    gram = d @ d.T
+    scale = max(np.trace(gram) / len(gram), np.finfo(float).tiny)
+
+    def left_out(ridge: float) -> float:
+        """The square of what each pose's entries differ from by what the others tell of them."""
+        hat = gram @ np.linalg.inv(gram + ridge * scale * np.eye(len(gram)))
+        return float(np.sum(((y - hat @ y) / (1 - np.diag(hat))[:, None]) ** 2))
+
+    ridge = min(RIDGES, key=left_out)
+    slopes = d.T @ np.linalg.solve(gram + ridge * scale * np.eye(len(gram)), y)
+    constant = entries.mean(axis=0) - middle @ slopes
+    return np.vstack([slopes, constant, entries.min(axis=0), entries.max(axis=0)])
+
+
+@partial(jax.jit, static_argnums=0)
+def _static_offsets(network: Swing, params: dict, model: Model, static: Array) -> Float[Array, "verts 3 poses"]:
+    """Return the offsets of the static garment, m."""
+    return decode(network, params, model, jnp.asarray(network.static.apply({"params": params["static"]}, static)))
