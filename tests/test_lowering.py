@@ -21,8 +21,8 @@ SQUARE = np.linspace(-1, 2, 9, dtype=np.float32).reshape(3, 3)
 FUNCTIONS = {
     "arithmetic": (lambda x, y: -(x * y - x / (2 + y * y)) + jnp.sqrt(1 + y * y), "Add Div Mul Neg Sqrt Sub"),
     "activations": (
-        lambda x, y: jax.nn.sigmoid(x) + jnp.tanh(y) + jax.nn.relu(x) + jnp.maximum(x, y),
-        "Add Max Relu Sigmoid Tanh",
+        lambda x, y: jax.nn.sigmoid(x) + jnp.tanh(y) + jax.nn.relu(x) + jnp.maximum(x, y) + jnp.exp(jnp.minimum(x, y)),
+        "Add Exp Max Min Relu Sigmoid Tanh",
     ),
     "a choice": (lambda x, y: jnp.where(x > y, x, y[0]), "Greater Slice Where"),
     "repeated axes that are never made": (lambda x, y: (x[:, None] + y[:, None][None]) * TABLE[:1, :, :3], "Add Mul"),

@@ -284,7 +284,9 @@ def stiffness(vibrations: RitzModes, static: Float[Array, "poses joints numbers"
     entries = jnp.clip(_matmul(slopes.T, static.reshape(len(static), -1).T) + constant, least, most)
     row, column = np.tril_indices(modes)
     entries = jnp.where((row == column)[:, None], jnp.exp(entries), entries)
-    c = jnp.zeros((modes, modes, len(static)), entries.dtype).at[row, column].set(entries)
+    place = np.zeros((modes, modes, len(row)))
+    place[row, column, np.arange(len(row))] = 1
+    c = _matmul(jnp.asarray(place.reshape(-1, len(row)), entries.dtype), entries).reshape(modes, modes, -1)
     return vibrations.energy * jnp.sum(c[:, None] * c[None], axis=2)
 
 
