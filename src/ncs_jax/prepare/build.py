@@ -29,8 +29,9 @@ from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
+from ncs_jax.training.shares import Piece, Shares, shares_of
 
-__all__ = ["Assembly", "build", "features_from_records", "tell_a_person"]
+__all__ = ["Assembly", "TrainingMotions", "build", "features_from_records", "tell_a_person"]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
@@ -39,20 +40,59 @@ CELL = 8.0  # m; side of the grid from whose corners motions are measured
 
 @dataclass(frozen=True)
 class Assembly(Setting):
-    """A scene made ready. `training_features` are what `track` gives; `model` is whole."""
+    """A scene made ready. `training_features` are what `track` gives; `model` is whole; `training` are all training motions."""
 
     network: Method
     training_features: MotionFeatures | None
+    training: TrainingMotions | None = None
 
     @property
     def track(self) -> MotionFeatures:
         """Return all training motions end to end, in the order of the scene's files, then their mirror images if any.
+
+        Of more than `shares.SHARE` frames they are pieces from the first motion to the last, of about so many frames.
 
         Raises:
             InputError: the scene is that of a loaded run, which is made ready without them.
         """
         mend = "a loaded run has no training motions: assemble its scene, ncs_jax.assemble(run.assembly.scene)"
         return required(self.training_features, "track", mend)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingMotions:
+    """The motions that a scene trains on, in the order of its files, then their mirror images if any.
+
+    shares: of them, where they are too many to be kept as features; see `training.shares`.
+    """
+
+    records: tuple[io.MotionRecord, ...]
+    shares: Shares | None
+
+    def features(self, model: Model, pieces: Sequence[Piece] | None) -> tuple[MotionFeatures, np.ndarray]:
+        """Return motions end to end, and the frames at which windows may end; all motions, or `pieces` of shares.
+
+        Shares have the same shapes: the character stands still in the frames after its last piece.
+        """
+        if self.shares is None or pieces is None:
+            found = features_from_records(model, *self.records)
+            return found, np.arange(len(found.start))
+        cut = [_part(self.records[piece.motion], piece.first, piece.stop) for piece in pieces]
+        lengths, leads = (np.array([of(p) for p in pieces]) for of in (lambda p: p.stop - p.first, lambda p: p.lead))
+        first = np.cumsum(lengths) - lengths
+        ends = np.concatenate([np.arange(a + lead, a + length) for a, lead, length in zip(first, leads, lengths, strict=True)])
+        if left := self.shares.size - int(lengths.sum()):
+            last = _part(cut[-1], len(cut[-1].poses) - 1)
+            cut.append(replace(last, poses=last.poses.repeat(left, 0), translation=last.translation.repeat(left, 0)))
+        found = features_from_records(model, *cut)
+        if found.origin is None:
+            found = replace(found, origin=jnp.zeros((self.shares.size, 3), found.static.dtype))
+        return found, ends
+
+
+def _part(record: io.MotionRecord, first: int, stop: int | None = None) -> io.MotionRecord:
+    """Return frames first to stop - 1 of a motion, no copies."""
+    return replace(record, poses=record.poses[first:stop], translation=record.translation[first:stop])
 
 
 def build(
@@ -80,9 +120,10 @@ def build(
     """
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
     automatic, scene = scene.network.cell == "auto", setting.scene
-    model, body, track, faces = setting.model, setting.body, None, None
+    model, body, track, faces, training = setting.model, setting.body, None, None, None
     if prepared is None:
-        track = _training_features(setting)
+        training = _training_motions(setting)
+        track, _ = training.features(model, None if training.shares is None else training.shares.spread())
     prepared = setting.prepared
     if model.body is not None and body is not None:
         faces = touchable_faces(model, body, prepared.part)
@@ -102,7 +143,7 @@ def build(
         model = replace(model, vibrations=_vibrations(prepared, dtype) if prepared.vibrations.size else None)
     network = network_from(scene, model)
     model = model.with_terms(terms) if terms else model
-    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track)
+    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track, training)
 
 
 def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
@@ -115,8 +156,8 @@ def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures)
     jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
-def _training_features(setting: Setting) -> MotionFeatures:
-    """Return the training motions end to end, with their mirror images if wanted; one frame at rest where there is none."""
+def _training_motions(setting: Setting) -> TrainingMotions:
+    """Return the training motions, with their mirror images if wanted; one frame at rest where there is none."""
     scene, model, body = setting.scene, setting.model, setting.body
     motions = [setting.motions[name] for name in scene.motion.files]
     if not motions:
@@ -130,7 +171,7 @@ def _training_features(setting: Setting) -> MotionFeatures:
         given = partner, axis, body.rest_rotations
         mirrored = [io.MotionRecord(*mirror(r.poses, r.translation, *given), r.fps, r.joint_names) for r in motions]
         motions = motions + mirrored
-    return features_from_records(model, *motions)
+    return TrainingMotions(tuple(motions), shares_of([len(r.poses) for r in motions], scene.training.window))
 
 
 def tell_a_person(words: str) -> None:

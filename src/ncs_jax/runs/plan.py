@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from ncs_jax.runs.placed_scene import PlacedScene
-from ncs_jax.training.batches import CHUNK
+from ncs_jax.training.batches import CHUNK, whole_chunks
 from ncs_jax.training.step import TrainState
 
-__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within", "whole_chunks"]
+__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within"]
 
 ENOUGH = 300  # steps; after fewer, a garment still looks as it did at the start
 EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
@@ -60,7 +60,7 @@ def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[],
     spec = placed.assembly.scene.training
 
     def lists() -> None:
-        placed.refresh(state.params)
+        placed.refresh(state.params, int(state.step))
         placed.rebuild_lists(state.params)
 
     def chunk() -> None:
@@ -88,8 +88,3 @@ def _seconds(work: Callable[[], object]) -> float:
     start = time.monotonic()
     work()
     return time.monotonic() - start
-
-
-def whole_chunks(steps: int) -> int:
-    """Return the next multiple of CHUNK."""
-    return -(-steps // CHUNK) * CHUNK
