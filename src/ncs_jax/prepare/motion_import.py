@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -22,12 +22,13 @@ from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
+from ncs_jax.scene.motion_lists import LISTING
 from ncs_jax.scene.motion_names import LISTS
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
 
-__all__ = ["lead_in_frames", "load_motion", "load_motions", "retarget_to_body"]
+__all__ = ["lead_in_frames", "load_motion", "load_motions", "one_by_one", "retarget_to_body"]
 
 FEW = 20  # motions that are named one by one as they are read
 EVERY = 5.0  # s between what is said of more
@@ -197,6 +198,16 @@ def _with_packaged_skeleton(motion: MotionRecord) -> MotionRecord:
     return motion
 
 
+def one_by_one(names: Collection[str], doing: str, say: Callable[[str], None]) -> Iterator[str]:
+    """Yield the names of motions; where they are many, say now and then what is done with them, and with how many already."""
+    told = time.monotonic() - EVERY
+    for number, name in enumerate(names):
+        if len(names) > FEW and time.monotonic() - told >= EVERY:
+            told = time.monotonic()
+            say(f"{doing}: {number} of {len(names)} motions")
+        yield name
+
+
 def load_motions(
     scene: Scene, body: io.BodyRecord | None, say: Callable[[str], None]
 ) -> tuple[Scene, dict[str, io.MotionRecord]]:
@@ -205,15 +216,12 @@ def load_motions(
     Raises:
         InputError: some cannot be used: one of them, or all that cannot, by what is wrong.
     """
-    names, motions, faults, told = list(dict.fromkeys(scene.motions)), {}, {}, -EVERY
+    names, motions, faults = list(dict.fromkeys(scene.motions)), {}, {}
     for note in scene.motion.found:
         say(note)
-    for number, name in enumerate(names):
+    for name in one_by_one(names, "reading", say):
         if len(names) <= FEW:
             say(f"reading {name}")
-        elif time.monotonic() - told > EVERY:
-            told = time.monotonic()
-            say(f"reading {len(names)} motions: {number} done")
         try:
             motions[name] = load_motion(scene, name, body)
         except InputError as error:
@@ -254,6 +262,8 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
     path, spec = scene.motion_file(name)
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
+    if path.suffix.lower() in ("", *LISTING) and not path.exists():  # else its suffix would be at fault
+        raise InputError("no such file or folder", file=path, mend="check the path")
     try:
         record = io.read_motion(path, frame_range=chosen)
         read = (

@@ -19,7 +19,7 @@ from ncs_jax.scene.motion_names import LISTS, split_frames
 if TYPE_CHECKING:
     from ncs_jax.scene.spec import Scene
 
-__all__ = ["with_each_motion"]
+__all__ = ["LISTING", "with_each_motion"]
 
 LISTING = (".txt", ".csv", ".tsv", ".lst", ".list")
 NAMING = ("file", "path", "filename", "file_path", "source_path", "motion", "name")  # columns of a table, the first that it has
