@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_right
 from collections.abc import Callable
+from itertools import cycle
 from typing import NamedTuple
 
 import jax
@@ -59,8 +60,10 @@ def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[],
     """
     spec = placed.assembly.scene.training
 
+    begins = cycle((int(state.step) + whole_chunks(spec.checkpoint_every), int(state.step)))  # of another share each time
+
     def lists() -> None:
-        placed.refresh(state.params, int(state.step))
+        placed.refresh(state.params, next(begins))
         placed.rebuild_lists(state.params)
 
     def chunk() -> None:

@@ -24,6 +24,7 @@ ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
 BARE = 1.0  # mm outside the cloth, from which skin is said to show
+NAMED = 8  # motions that a run trained on which the page names
 MEASURED = 24  # frames, at most, of which strain and penetration are measured
 
 
@@ -80,7 +81,9 @@ def preview(
         f"{alpha:g}": animation if alpha == shown else replace(animation, garment=run.animate(track, alpha))
         for alpha in (ALPHAS if controlled else (0.0,))
     }
-    facts = {"motion": names[0], "trained": f"{run.steps} steps on {', '.join(scene.motion.files)}"}
+    files, left = scene.motion.files[:NAMED], len(scene.motion.files) - NAMED
+    more = f" and {left} more" if left > 0 else ""
+    facts = {"motion": names[0], "trained": f"{run.steps} steps on {', '.join(files)}{more}"}
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
     write(facts=facts)
 
