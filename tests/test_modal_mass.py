@@ -11,7 +11,7 @@ from ncs_jax.network.methods.modal_mass import constants, modal_mass, pulled, ro
 def test_joints_give_what_a_sum_over_the_vertices_gives(rng):
     verts, joints, modes, poses = 30, 4, 3, 5
     weights = rng.dirichlet(np.ones(3), verts)
-    weights = blend_from(np.insert(weights, 1, 0, axis=1), jnp.float64)  # one joint carries nothing
+    weights = blend_from(np.insert(weights, 1, 0, axis=1), dtype=jnp.float64)  # one joint carries nothing
     directions, mass = rng.normal(size=(verts, 3, modes)), rng.uniform(1, 2, verts)
     turns = Rotation.from_rotvec(rng.normal(size=(joints * 2 * poses, 3))).as_matrix().reshape(2, poses, joints, 3, 3)
     matrices = np.concatenate([turns, rng.normal(size=(2, poses, joints, 3, 1))], axis=-1)
