@@ -35,6 +35,7 @@ __all__ = ["Assembly", "TrainingMotions", "build", "features_from_records", "tel
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
+LONG = 4096  # frames of which features are made at once, at most
 CELL = 8.0  # m; side of the grid from whose corners motions are measured
 
 
@@ -244,16 +245,29 @@ def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeat
     dtype = model.skeleton.joints.dtype
     lengths = [len(r.poses) for r in records]
     start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-    poses = jnp.asarray(np.concatenate([r.poses for r in records]).astype(dtype))
+    poses = np.concatenate([r.poses for r in records])
     origins = [CELL * np.round(r.translation[0].astype(np.float64) / CELL) for r in records]
     near = np.concatenate([r.translation - origin for r, origin in zip(records, origins, strict=True)])
-    found = motion_features(
-        model, local_rotations(model, poses), jnp.asarray(near.astype(dtype)), jnp.asarray(start, jnp.int32)
-    )
+    found = _in_parts(model, poses.astype(dtype), near.astype(dtype), start.astype(np.int32))
     if model.under:
         layers = jnp.concatenate([_layer_transforms(layer, records, origins, dtype) for layer in model.under], axis=1)
         found = replace(found, matrices=jnp.concatenate([found.matrices, layers], axis=1))
     return replace(found, origin=jnp.asarray(np.repeat(origins, lengths, axis=0), dtype)) if np.any(origins) else found
+
+
+def _in_parts(model: Model, poses: np.ndarray, translation: np.ndarray, start: np.ndarray) -> MotionFeatures:
+    """Return `motion_features`, of more than `LONG` frames in parts, each with the two frames before it."""
+    frames = len(start)
+    if frames <= LONG:
+        rotations = local_rotations(model, jnp.asarray(poses))
+        return motion_features(model, rotations, jnp.asarray(translation), jnp.asarray(start))
+    parts = []
+    for first in range(0, frames, LONG):
+        at = np.arange(first - 2, first + LONG).clip(0, frames - 1)
+        local = local_rotations(model, jnp.asarray(poses[at]))
+        found = motion_features(model, local, jnp.asarray(translation[at]), jnp.asarray(np.maximum(start[at] - first + 2, 0)))
+        parts.append([np.asarray(a)[2 : 2 + frames - first] for a in (found.static, found.dynamic, found.matrices)])
+    return MotionFeatures(*(jnp.asarray(np.concatenate(each)) for each in zip(*parts, strict=True)), jnp.asarray(start))
 
 
 def _layer_transforms(layer: Layer, records, origins, dtype) -> Float[Array, "frames verts 3 4"]:

@@ -41,8 +41,8 @@ RANGES = {
 }
 DEEP = 0.01  # m that vertices may be inside the body, where the body alone carries the garment,
 MANY = 0.02  # and the share of the vertices that may be deeper
-POSES = 8  # checked in every motion,
-MOST = 400  # and in all together; of more motions not all
+POSES = 8  # checked in every motion
+MOST = 400  # poses that are checked in all motions together
 NAMED = 6  # motions that a risk names
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
 
@@ -172,19 +172,29 @@ def _inside(
         yield Risk(f"garment inside the body {when}", value, "contact pushes it out on the nearer side, right or wrong", mend)
 
 
-def _motion(a: Setting, faces: np.ndarray | None, name: str) -> Iterator[Risk]:
-    """Yield the risks of a motion: how far it goes, cloth inside the body."""
-    record = a.motions[name]
-    path = record.translation.astype(np.float64)
+def _far(a: Setting, name: str) -> Iterator[Risk]:
+    """Yield the risk of a motion that goes too far."""
+    path = a.motions[name].translation.astype(np.float64)
     far = float(np.linalg.norm(path - path[:1], axis=1).max())
     rounding = "positions are rounded to more than 0.1 mm"
     for risk in _outside("distance from the start", far, f"{far:.0f} m in {name}", rounding, "cut the motion"):
         yield replace(risk, motion=name)
-    if faces is not None:
-        frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
-        mend = "mend the pose, or smooth the skinning weights"
+
+
+def _inside_in(a: Setting, faces: np.ndarray, say: Callable[[str], None]) -> Iterator[Risk]:
+    """Yield the risks of cloth inside the body as it moves: of `POSES` of each motion, or of the most bent one of `MOST`."""
+    names = list(a.motions)
+    many = len(names) > MOST // POSES
+    if len(names) > MOST:
+        names = [names[i] for i in np.linspace(0, len(names) - 1, MOST).astype(int)]
+    mend = "mend the pose, or smooth the skinning weights"
+    for name in one_by_one(names, "looking for cloth inside the body", say):
+        poses = a.motions[name].poses
+        frames = np.unique(np.linspace(0, len(poses) - 1, POSES).astype(int))
+        if many:
+            frames = np.abs(poses[:, 1:]).sum(axis=(1, 2)).argmax(keepdims=True)
         when = f"where the body alone carries it in {name}"
-        for risk in _inside(a, faces, record.poses[frames], when, (DEEP, MANY), mend):
+        for risk in _inside(a, faces, poses[frames], when, (DEEP, MANY), mend):
             yield replace(risk, motion=name)
 
 
@@ -236,6 +246,5 @@ def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[
         below = "give it room over the garment below where it was made, or fit it with a larger ncs fit --clearance"
         mend = below if a.model.under else "push it out: ncs fit"
         found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), mend)
-    for name in one_by_one(a.motions, "looking for cloth inside the body", say):
-        found += _motion(a, faces, name)
-    return found
+    found += [risk for name in a.motions for risk in _far(a, name)]
+    return found if faces is None else [*found, *_inside_in(a, faces, say)]
