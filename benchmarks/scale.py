@@ -14,7 +14,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -29,8 +28,7 @@ from ncs_jax.prepare.retarget import body_names
 from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.features import mirror
-from ncs_jax.scene.motion_lists import with_each_motion
-from ncs_jax.scene.spec import Scene, load_scene
+from ncs_jax.scene.spec import Scene, load_scene, scene_from
 from ncs_jax.training.batches import CHUNK
 from ncs_jax.training.devices import trim_memory
 
@@ -91,7 +89,6 @@ def point(scene: Scene, repeats: int) -> dict:
 
     forget_peak()
     stage("start")
-    scene = with_each_motion(scene)
     assembly = assemble(scene)
     trim_memory()
     stage("made ready")
@@ -176,8 +173,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] == [POINT]:
         try:
             scene = load_scene(given[1])
-            motion = replace(scene.motion, files=tuple(json.loads(given[3])), validation=())
-            found = point(replace(scene, motion=motion), int(given[2]))
+            tables = scene.to_dict()
+            tables["motion"] |= {"files": json.loads(given[3]), "validation": []}
+            found = point(scene_from(tables, scene.source), int(given[2]))
             print(json.dumps(found, default=lambda a: a.tolist()))
         except InputError as error:
             print(f"scale: {error}", file=sys.stderr)

@@ -29,7 +29,7 @@ from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
-from ncs_jax.training.shares import Piece, Shares, shares_of
+from ncs_jax.training.shares import Shares, Stretch, shares_of
 
 __all__ = ["Assembly", "TrainingMotions", "build", "features_from_records", "tell_a_person"]
 
@@ -70,7 +70,7 @@ class TrainingMotions:
     records: tuple[io.MotionRecord, ...]
     shares: Shares | None
 
-    def features(self, model: Model, pieces: Sequence[Piece] | None) -> tuple[MotionFeatures, np.ndarray]:
+    def features(self, model: Model, pieces: Sequence[Stretch] | None) -> tuple[MotionFeatures, np.ndarray]:
         """Return motions end to end, and the frames at which windows may end; all motions, or `pieces` of shares.
 
         Shares have the same shapes: the character stands still in the frames after its last piece.

@@ -6,20 +6,15 @@ import csv
 import glob
 import os
 import re
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_names import LISTS, split_frames
 
-if TYPE_CHECKING:
-    from ncs_jax.scene.spec import Scene
-
-__all__ = ["LISTING", "with_each_motion"]
+__all__ = ["LISTING", "Found", "each_motion"]
 
 LISTING = (".txt", ".csv", ".tsv", ".lst", ".list")
 NAMING = ("file", "path", "filename", "file_path", "source_path", "motion", "name")  # columns of a table, the first that it has
@@ -31,49 +26,59 @@ ROTATIONS = {"poses", "quaternions", "root_orient"}
 SHOWN = 5  # names of files that are told of
 
 
-def with_each_motion(scene: Scene) -> Scene:
-    """Return a scene that names each of its motions, with the settings of the name that it came by.
+class Found(NamedTuple):
+    """Motions one by one: those of each list, the settings of those that have some, and in words what there was."""
+
+    lists: dict[str, tuple[str, ...]]
+    own: dict[str, dict[str, Any]]
+    told: tuple[str, ...]
+
+
+def each_motion(
+    given: dict[str, tuple[str, ...]], own: dict[str, dict[str, Any]], path: Callable[[str], Path], source: str
+) -> Found:
+    """Return each motion of the lists `files` and `validation`, with the settings of the name that it came by.
 
     A folder stands for all motions in it and in its folders; `*`, `?` and `**` for what they match; a .txt or .csv for what it
     lists. Frames behind such a name, [START:STOP], are those of each motion. A motion that is also named by itself is that
-    alone, and one to validate on is not among those that many were named by. `motion.found` says what there was.
+    alone, and one to validate on is not among those that many were named by.
+
+    Args:
+        given: the names in a scene file. own: the settings of each name that has some. path: gives the path of a name. source:
+            what an error names.
 
     Raises:
-        InputError: there is no motion under a name.
+        InputError: there is no motion under a name, or none is left to train on.
     """
-    motion = scene.motion
-    many = {name: found for name in scene.motions if (found := _many(name, scene.path)) is not None}
+    every = [name for key in LISTS for name in given[key]]
+    many = {name: found for name in every if (found := _many(name, path)) is not None}
     if not many:
-        return scene
-    own, notes = dict(motion.own), []
-    alone = {name for name in scene.motions if name not in many}
+        return Found(given, own, ())
+    own, notes, alone = dict(own), [], {name for name in every if name not in many}
     lists: dict[str, tuple[str, ...]] = {}
     validated: set[str] = set()
 
     def real(name: str) -> str:
-        return os.path.realpath(scene.path(split_frames(name)[0]))
+        return os.path.realpath(path(split_frames(name)[0]))
 
     for key in reversed(LISTS):  # those to validate on first
         names: dict[str, None] = {}
-        for name in getattr(motion, key):
+        for name in given[key]:
             found, skipped = many.get(name, ([name], Counter()))
             if not found:
-                raise _nothing(name, skipped, f"motion.{key}", scene.source)
+                raise _nothing(name, skipped, f"motion.{key}", source)
             kept = found if name in alone else [m for m in dict.fromkeys(found) if m not in alone and m not in names]
-            if key == "files" and name not in alone and lists["validation"]:
-                kept = [m for m in kept if real(m) not in validated]
             if name not in alone:
+                kept = [m for m in kept if real(m) not in validated] if validated else kept
                 notes.append(f"{name}: {len(kept)} motions{_left_out(skipped)}")
                 own |= {m: own[name] for m in kept if name in own}
             names |= dict.fromkeys(kept)
         lists[key] = tuple(names)
         validated = {real(name) for name in names}
-    if motion.files and not lists["files"]:
+    if given["files"] and not lists["files"]:
         mend = "leave some of them out of motion.validation"
-        raise InputError("motions to train on expected", file=scene.source, field="motion.files", value=motion.files, mend=mend)
-    for name in many:
-        own.pop(name, None)
-    return replace(scene, motion=replace(motion, **lists, own=own, found=tuple(reversed(notes))))
+        raise InputError("motions to train on expected", file=source, field="motion.files", value=given["files"], mend=mend)
+    return Found(lists, {name: settings for name, settings in own.items() if name not in many}, tuple(reversed(notes)))
 
 
 def _nothing(name: str, skipped: Counter, field: str, source: str) -> InputError:
@@ -164,23 +169,16 @@ def _kind(name: str) -> str:
 
 def _is_motion(file: Path) -> bool:
     """Tell a file that may hold a motion, by its name, and of arrays by theirs; what is damaged counts as one."""
-    from ncs_jax.io.character.motion import FORMATS
+    from ncs_jax.io.character.motion import FORMATS, TABLES
 
     suffix = file.suffix.lower()
     if suffix not in FORMATS or BESIDE.match(file.name):
         return False
-    if AMASS.search(file.name) or suffix not in (".npz", ".h5", ".hdf5"):
+    if AMASS.search(file.name) or suffix not in TABLES:
         return True
     try:
-        if suffix == ".npz":
-            with zipfile.ZipFile(file) as archive:
-                names = {name.removesuffix(".npy") for name in archive.namelist()}
-        else:
-            import h5py
-
-            with h5py.File(file) as table:
-                names = set(table)
-    except (OSError, zipfile.BadZipFile):
+        names = set(TABLES[suffix](file, lambda _: False).names)
+    except InputError:
         return True  # reading it says what is wrong
     return bool(names & ROTATIONS) or not names & {"vertices", "faces", "betas"}
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_jax.errors import InputError
-from ncs_jax.scene.motion_lists import with_each_motion
+from ncs_jax.scene.motion_lists import each_motion
 from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
 
 __all__ = [
@@ -341,7 +341,6 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         motion, own = named_motions(motion, source or "scene", check, each)
         tables = {**tables, "motion": motion}
     scene = _parse(Scene, tables, source or "scene", "")
-    scene = dataclasses.replace(scene, motion=dataclasses.replace(scene.motion, own=own))
     gravity = scene.physics.gravity
     if len(gravity) != 3:
         raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
@@ -354,7 +353,10 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         raise InputError("an even last size expected", file=source, field="network.static", value=list(scene.network.static))
     if scene.garment.file in ("", "none"):
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
-    return with_each_motion(dataclasses.replace(scene, source=source))
+    scene = dataclasses.replace(scene, source=source)
+    found = each_motion({key: getattr(scene.motion, key) for key in LISTS}, own, scene.path, source)
+    motion = dataclasses.replace(scene.motion, **found.lists, own=found.own, found=found.told)
+    return dataclasses.replace(scene, motion=motion)
 
 
 def template() -> str:

@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Piece", "Shares", "shares_of"]
+__all__ = ["Shares", "Stretch", "shares_of"]
 
 SHARE = 4096  # frames; the motions of a scene that has no more are kept whole
 PIECE = 256  # frames of a piece, at most
 LEAD = 30  # frames in front of a piece, at least, in which its windows and its swing begin
 
 
-class Piece(NamedTuple):
+class Stretch(NamedTuple):
     """Frames first to stop - 1 of a motion, by its number; of these, no window ends at the first `lead`."""
 
     motion: int
@@ -33,11 +33,11 @@ class Piece(NamedTuple):
 class Shares:
     """Pieces of motions, and how many shares a round deals them out to. No share has more than `size` frames."""
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[Stretch, ...]
     count: int
     size: int
 
-    def share(self, seed: int, number: int) -> list[Piece]:
+    def share(self, seed: int, number: int) -> list[Stretch]:
         """Return the pieces of a share, in their order; shares number 0 to count - 1 are the first round."""
         turn, part = divmod(number, self.count)
         order = np.random.default_rng([seed, 2, turn]).permutation(len(self.pieces))
@@ -45,7 +45,7 @@ class Shares:
         before = np.cumsum(frames[order]) - frames[order]
         return [self.pieces[i] for i in np.sort(order[before * self.count // frames.sum() == part])]
 
-    def spread(self) -> list[Piece]:
+    def spread(self) -> list[Stretch]:
         """Return pieces that are evenly spread over all motions, from the first on, of about as many frames as a share."""
         some = np.linspace(0, len(self.pieces) - 1, max(1, len(self.pieces) // self.count)).round().astype(int)
         chosen = [self.pieces[i] for i in np.unique(some)]
@@ -67,7 +67,7 @@ def shares_of(lengths: Sequence[int], window: int) -> Shares | None:
     pieces = []
     for motion, length in enumerate(lengths):
         cuts = np.linspace(0, length, -(-length // most) + 1).round().astype(int).tolist()
-        pieces += [Piece(motion, max(0, a - lead), b, min(lead, a)) for a, b in pairwise(cuts)]
+        pieces += [Stretch(motion, max(0, a - lead), b, min(lead, a)) for a, b in pairwise(cuts)]
     frames = [piece.stop - piece.first for piece in pieces]
     count = -(-sum(frames) // (share - max(frames)))
     return Shares(tuple(pieces), count, -(-sum(frames) // count) + max(frames))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -81,9 +81,7 @@ def preview(
         f"{alpha:g}": animation if alpha == shown else replace(animation, garment=run.animate(track, alpha))
         for alpha in (ALPHAS if controlled else (0.0,))
     }
-    files, left = scene.motion.files[:NAMED], len(scene.motion.files) - NAMED
-    more = f" and {left} more" if left > 0 else ""
-    facts = {"motion": names[0], "trained": f"{run.steps} steps on {', '.join(files)}{more}"}
+    facts = {"motion": names[0], "trained": f"{run.steps} steps on {_some(scene.motion.files)}"}
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
     write(facts=facts)
 
@@ -99,6 +97,12 @@ def preview(
     write(facts=facts | _facts_of(quantities))
     tell(PreviewStep(None, "done", 1.0))
     return quantities
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
 
 
 def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
