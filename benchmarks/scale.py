@@ -50,6 +50,7 @@ def make_motions(folder: Path, minutes: float, clips: int, seed: int = 0) -> int
         poses, path = _played(a, length, rng)
         other, _ = _played(b, length, rng)
         share = rng.uniform(0, 0.5, (1, poses.shape[1], 1))
+        share[:, 0] = 0  # the heading is its own
         poses = poses + share * (other - poses)  # small angles: as good as between rotations
         if rng.random() < 0.5:
             poses, path = mirror(poses, path, partner, axis)
