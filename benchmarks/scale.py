@@ -57,7 +57,7 @@ def make_motions(folder: Path, minutes: float, clips: int, seed: int = 0) -> int
         turn = Rotation.from_rotvec([0, rng.uniform(-np.pi, np.pi), 0])
         poses[:, 0], path = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec(), turn.apply(path)
         subject = folder / f"Set{number % 3}" / f"Subject_{number % SUBJECTS}_F"
-        names = {"joint_names": np.array(body.joint_names), "fps": np.float32(FPS)}
+        names = {"joint_names": np.array(body.joint_names), "fps": np.array(FPS, np.float32)}
         write_npz(
             subject / f"clip {number:05d}_poses.npz", poses=poses.astype(np.float32), trans=path.astype(np.float32), **names
         )

@@ -124,16 +124,14 @@ def resample(
     for first in range(0, len(between), BLOCK):
         some = between[first : first + BLOCK]
         at = np.pad(some, (0, BLOCK - len(some)), mode="edge")
-        new[some] = np.asarray(_between(poses[low[at]], poses[high[at]], t[at]))[: len(some)]
+        new[some] = np.asarray(_between(*map(jnp.asarray, (poses[low[at]], poses[high[at]], t[at]))))[: len(some)]
     moved = translation[low] + t[:, None].astype(translation.dtype) * (translation[high] - translation[low])
     return new, moved
 
 
 @jax.jit
 def _between(
-    a: Float[Array | np.ndarray, "frames joints 3"],
-    b: Float[Array | np.ndarray, "frames joints 3"],
-    t: Float[Array | np.ndarray, "frames"],
+    a: Float[Array, "frames joints 3"], b: Float[Array, "frames joints 3"], t: Float[Array, "frames"]
 ) -> Float[Array, "frames joints 3"]:
     """Return rotations a share t of the way from a to b, axis times angle."""
     mixed = slerp(axis_angle_to_quaternion(a), axis_angle_to_quaternion(b), jnp.broadcast_to(t[:, None], a.shape[:2]))

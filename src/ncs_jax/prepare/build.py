@@ -267,7 +267,8 @@ def _in_parts(model: Model, poses: np.ndarray, translation: np.ndarray, start: n
         local = local_rotations(model, jnp.asarray(poses[at]))
         found = motion_features(model, local, jnp.asarray(translation[at]), jnp.asarray(np.maximum(start[at] - first + 2, 0)))
         parts.append([np.asarray(a)[2 : 2 + frames - first] for a in (found.static, found.dynamic, found.matrices)])
-    return MotionFeatures(*(jnp.asarray(np.concatenate(each)) for each in zip(*parts, strict=True)), jnp.asarray(start))
+    static, dynamic, matrices = (jnp.asarray(np.concatenate(each)) for each in zip(*parts, strict=True))
+    return MotionFeatures(static, dynamic, matrices, jnp.asarray(start))
 
 
 def _layer_transforms(layer: Layer, records, origins, dtype) -> Float[Array, "frames verts 3 4"]:

@@ -23,7 +23,6 @@ from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, 
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.motion_lists import LISTING
-from ncs_jax.scene.motion_names import LISTS
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
@@ -239,8 +238,8 @@ def load_motions(
         )  # fmt: skip
     what = f"{len(faults)} of {len(names)} motions are left out"
     warnings.warn(f"{what}:\n{_by_kind(faults)}", category=InputWarning, stacklevel=4)
-    kept = {key: tuple(name for name in getattr(scene.motion, key) if name in motions) for key in LISTS}
-    return replace(scene, motion=replace(scene.motion, **kept)), motions
+    files, validation = (tuple(n for n in names if n in motions) for names in (scene.motion.files, scene.motion.validation))
+    return replace(scene, motion=replace(scene.motion, files=files, validation=validation)), motions
 
 
 def _by_kind(faults: Mapping[str, InputError]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -48,6 +49,8 @@ class PlacedScene:
         self._programs, self._chunk, self._metrics = programs or Programs(), *_functions(assembly, self.mesh)
         self._compiled: dict[int, Compiled] = {}
         self._every, self._number = whole_chunks(spec.checkpoint_every), -1  # steps that a share is trained on, and which it is
+        self.features: MotionFeatures
+        self._everywhere: Any  # the model and the features, with bodies
         self._show(0)
 
     @property

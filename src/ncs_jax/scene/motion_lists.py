@@ -29,7 +29,8 @@ SHOWN = 5  # names of files that are told of
 class Found(NamedTuple):
     """Motions one by one: those of each list, the settings of those that have some, and in words what there was."""
 
-    lists: dict[str, tuple[str, ...]]
+    files: tuple[str, ...]
+    validation: tuple[str, ...]
     own: dict[str, dict[str, Any]]
     told: tuple[str, ...]
 
@@ -51,9 +52,9 @@ def each_motion(
         InputError: there is no motion under a name, or none is left to train on.
     """
     every = [name for key in LISTS for name in given[key]]
-    many = {name: found for name in every if (found := _many(name, path)) is not None}
+    many = {name: under for name in every if (under := _many(name, path)) is not None}
     if not many:
-        return Found(given, own, ())
+        return Found(given["files"], given["validation"], own, ())
     own, notes, alone = dict(own), [], {name for name in every if name not in many}
     lists: dict[str, tuple[str, ...]] = {}
     validated: set[str] = set()
@@ -78,7 +79,8 @@ def each_motion(
     if given["files"] and not lists["files"]:
         mend = "leave some of them out of motion.validation"
         raise InputError("motions to train on expected", file=source, field="motion.files", value=given["files"], mend=mend)
-    return Found(lists, {name: settings for name, settings in own.items() if name not in many}, tuple(reversed(notes)))
+    own = {name: settings for name, settings in own.items() if name not in many}
+    return Found(lists["files"], lists["validation"], own, tuple(reversed(notes)))
 
 
 def _nothing(name: str, skipped: Counter, field: str, source: str) -> InputError:

@@ -355,7 +355,7 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
     scene = dataclasses.replace(scene, source=source)
     found = each_motion({key: getattr(scene.motion, key) for key in LISTS}, own, scene.path, source)
-    motion = dataclasses.replace(scene.motion, **found.lists, own=found.own, found=found.told)
+    motion = dataclasses.replace(scene.motion, files=found.files, validation=found.validation, own=found.own, found=found.told)
     return dataclasses.replace(scene, motion=motion)
 
 

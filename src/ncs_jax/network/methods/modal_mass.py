@@ -39,7 +39,7 @@ def modal_mass(
     constants: Float[Array, "modes modes axes axes"], now: Float[Array, "3 axes poses"], then: Float[Array, "3 axes poses"]
 ) -> Float[Array, "modes modes poses"]:
     """Return P_t^T M P_s (modes, modes, poses), kg m^2, of the rotations now, t, and then, s, see `rotations_of`."""
-    products = sum(now[i, :, None] * then[i, None] for i in range(3))
+    products = now[0, :, None] * then[0, None] + now[1, :, None] * then[1, None] + now[2, :, None] * then[2, None]
     modes, poses = len(constants), now.shape[-1]
     found = jnp.matmul(constants.reshape(modes * modes, -1), products.reshape(-1, poses), precision="highest")
     return found.reshape(modes, modes, poses)
@@ -49,6 +49,7 @@ def pulled(
     directions: Float[Array, "verts 3 modes"], transforms: Float[Array, "verts 3 4 poses"], force: Float[Array, "verts 3 poses"]
 ) -> Float[Array, "modes poses"]:
     """Return P_t^T f (modes, poses): the part of forces f in each pose that moves the vibrations."""
-    unposed = sum(transforms[:, i, :3] * force[:, i, None] for i in range(3))
+    columns = [transforms[:, i, :3] * force[:, i, None] for i in range(3)]
+    unposed = columns[0] + columns[1] + columns[2]
     flat = directions.reshape(-1, directions.shape[2])
     return jnp.matmul(flat.T, unposed.reshape(len(flat), -1), precision="highest")
