@@ -114,6 +114,10 @@ def test_training_takes_one_share_after_another_whenever_it_begins(many, plain_j
     assert not np.array_equal(seen[0][1], seen[1][1])
     once = np.concatenate([seen[0][1], seen[1][1]]).ravel()[: len(through._last)]
     assert len(set(once.tolist())) == len(once)
+    piece = later._pieces[1]
+    at = later._pieces[0].stop - later._pieces[0].first
+    mirrored = ", mirrored" if piece.motion else ""  # the scene names one file
+    assert later._named(at + 2) == f" (that is frame {piece.first + 2} of {many.scene.motion.files[0]}{mirrored})"
 
 
 def test_resumed_between_two_shares_a_run_is_that_which_went_through(small, tmp_path, plain_jax):

@@ -57,7 +57,7 @@ def check(options) -> int:
     groups = _alike(setting.motions)
     drawn = _draw(options.out, setting, _worst_first(groups, setting, risks))
     print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
-    _tell_risks(risks, Path(options.out).with_suffix(".txt"))
+    _tell_risks(risks, Path(options.out).with_suffix(".risks.txt"))
     for note in scene.motion.found:
         tell("found", note)
     if not risks:
@@ -89,8 +89,11 @@ def _tell_risks(risks: Sequence[Risk], file: Path) -> None:
             tell("", f"and {len(alike) - len(few)} more of this kind, in {len({risk.motion for risk in alike})} motions")
     if shortened:
         lines = [f"{risk.motion or '-'}\t{_words(risk)}" for risk in risks]
-        file.write_text("motion\trisk\n" + "\n".join(lines) + "\n", encoding="utf-8")
-        tell("list", f"{file}: all {len(risks)} risks, a line each")
+        try:
+            file.write_text("motion\trisk\n" + "\n".join(lines) + "\n", encoding="utf-8")
+            tell("list", f"{file}: all {len(risks)} risks, a line each")
+        except OSError as error:  # as of the picture
+            tell("list", f"none: {type(error).__name__} {error}")
 
 
 def _words(risk: Risk) -> str:

@@ -31,7 +31,7 @@ __all__ = ["lead_in_frames", "load_motion", "load_motions", "one_by_one", "retar
 
 FEW = 20  # motions that are named one by one as they are read
 EVERY = 5.0  # s between what is said of more
-NAMED = 20  # files of a kind of fault that are named
+NAMED = 20  # kinds of faults that are told, and files of each that are named
 
 LOOK = 10  # first frames of a file, and last, among which a T-pose is looked for
 JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
@@ -249,11 +249,11 @@ def _by_kind(faults: Mapping[str, InputError]) -> str:
         kind = re.sub(r"\d+", "#", f"{error.field}: {error.expected}"), error.mend or ""
         kinds.setdefault(kind, []).append(name)
     lines = []
-    for names in sorted(kinds.values(), key=len, reverse=True):
+    for names in sorted(kinds.values(), key=len, reverse=True)[:NAMED]:
         also = names[1 : NAMED + 1]
         more = f" and {len(names) - 1 - len(also)} more" if len(names) > 1 + len(also) else ""
         lines.append(f"  {faults[names[0]]}" + (f"; so too {', '.join(also)}{more}" if also else ""))
-    return "\n".join(lines)
+    return "\n".join(lines) + (f"\n  and {len(kinds) - NAMED} faults of other kinds" if len(kinds) > NAMED else "")
 
 
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:

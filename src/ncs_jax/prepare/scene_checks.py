@@ -188,7 +188,8 @@ def _inside_in(a: Setting, faces: np.ndarray, say: Callable[[str], None]) -> Ite
     if len(names) > MOST:
         names = [names[i] for i in np.linspace(0, len(names) - 1, MOST).astype(int)]
     mend = "mend the pose, or smooth the skinning weights"
-    for name in one_by_one(names, "looking for cloth inside the body", say):
+    which = ", in the most bent pose of each" if many else ""
+    for name in one_by_one(names, f"looking for cloth inside the body{which}", say):
         poses = a.motions[name].poses
         frames = np.unique(np.linspace(0, len(poses) - 1, POSES).astype(int))
         if many:

@@ -92,7 +92,18 @@ class PlacedScene:
 
     def diagnose(self, state: TrainState) -> str:
         """Return why the last dropped step was dropped."""
-        return diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
+        found = diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
+        return f"{found}{self._named(int(state.fault.frame))}"
+
+    def _named(self, frame: int) -> str:
+        """Return in words which frame of which file a frame of a share is; nothing where there are no shares."""
+        files = self.assembly.scene.motion.files
+        for piece in self._pieces:
+            if frame < piece.stop - piece.first:
+                mirrored = ", mirrored" if piece.motion >= len(files) else ""
+                return f" (that is frame {piece.first + frame} of {files[piece.motion % len(files)]}{mirrored})"
+            frame -= piece.stop - piece.first
+        return ""
 
     def refresh(self, params: dict, step: int) -> None:
         """Take the motions that are trained on from a step on, and what the network adds to them: see `Method.refresh`."""
@@ -121,12 +132,12 @@ class PlacedScene:
         training, spec = required(self.assembly.training, "training"), self.assembly.scene.training
         if number == self._number or (training.shares is None and self._number >= 0):
             return
-        self._number = number
+        self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
         if training.shares is None:
             self._bare, self._last = self.assembly.track, np.arange(len(self.assembly.track.start))
         else:
             self._everywhere = None  # before the next one takes as much memory
-            self._bare, self._last = training.features(self.assembly.model, training.shares.share(self.seed, number))
+            self._bare, self._last = training.features(self.assembly.model, self._pieces)
         self.features = self._bare
         self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
 
