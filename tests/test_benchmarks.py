@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import growth, inference, quality, simulator, start, training, work
+from benchmarks import growth, inference, quality, scale, simulator, start, training, work
 from benchmarks.cost import counted
 from benchmarks.measure import COPIES, Limits, Work, apart, looped, nudged, table, timed
 from experiments import seeds
-from ncs_jax import assemble, io, load_scene, train
+from ncs_jax import assemble, io, load_scene, scene_from, train
 from ncs_jax.network.methods.method import decode, for_inference
 from ncs_jax.simulation.solver.cholesky import elimination
 from ncs_jax.training.step import initial_state
@@ -162,6 +162,15 @@ def test_growth(tmp_path, capsys):
     assert "peak MB" in capsys.readouterr().out
     assert "no such scene file" in apart("benchmarks.growth", ["--point", str(tmp_path / "no.toml"), "1", "{}"], 100)["failed"]
     assert "longer than" in apart("benchmarks.growth", ["--point", str(tmp_path / "scene.toml"), "1", "{}"], 0.1)["failed"]
+
+
+def test_motions_are_made_as_amass_lays_them_out(tmp_path):
+    assert scale.make_motions(tmp_path, 0.2, 12) == 360
+    found = scene_from({"motion": {"files": [str(tmp_path)]}}).motion
+    assert len(found.files) == 12 and "12 shape.npz" in found.found[0]
+    records = [io.read_motion(name) for name in found.files]
+    assert sum(len(r.poses) for r in records) == 360 and {r.poses.shape[1] for r in records} == {31}
+    assert max(np.abs(np.diff(r.poses[:, 1:], axis=0)).max(initial=0) for r in records) < 0.5  # rad; none jumps
 
 
 def test_finer_scenes_have_more_of_the_same(tmp_path):

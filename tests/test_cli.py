@@ -25,6 +25,7 @@ from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.cli.train import _TrainingBar
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
+from ncs_jax.prepare.scene_checks import Risk
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 from ncs_jax.view.character import body_vertices
@@ -341,6 +342,24 @@ def test_check_tells_motions_that_match_alike_once(capsys):
     assert text.index("odd.bvh: 5 frames") < text.index(other) < text.index("alike")  # alone, below its own line
     alone = told({"1.bvh": many["1.bvh"]}, capsys)
     assert "alike" not in alone and alone.count(pairs) == 1
+
+
+def test_check_counts_many_motions_and_their_risks(tmp_path, capsys):
+    pairs, other = "retargeted by joint names, 3 of 5: Hips by hip", "retargeted by joint names, 2 of 5: Hips by root"
+    many = {f"{k}.bvh": (pairs, f"a unit is {k} m") for k in range(2990)}
+    text = told(many | {f"odd{k}.bvh": (other,) for k in range(10)}, capsys)
+    assert "3000 motions: 15000 frames at 30 per second, 8.33 minutes; 5 to 5 frames each" in text
+    assert text.count("\n") < 12 and "2990 motions" in text and "10 motions" in text and text.count(other) == 1
+    risks = [Risk("fast motion", f"thrown by {k} in {k}.bvh", "it lags", "slow it", f"{k}.bvh") for k in range(400)]
+    check._tell_risks([*risks, Risk("size", "9 m", "rounding", "scale it")], tmp_path / "check.txt")
+    text = capsys.readouterr().out
+    assert text.count("at risk") == 4 and "and 397 more of this kind, in 400 motions" in text and "size: 9 m" in text
+    rows = (tmp_path / "check.txt").read_text().splitlines()
+    assert (
+        len(rows) == 402 and rows[7].startswith("6.bvh\tfast motion: thrown by 6") and str(tmp_path) in text.replace("\n", "")
+    )
+    check._tell_risks(risks[:6], tmp_path / "few.txt")
+    assert capsys.readouterr().out.count("at risk") == 6 and not (tmp_path / "few.txt").exists()
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,8 @@ METHODS = ["gated", "linear", "swing", "pbns", "snug"]
 
 # Those that the runtimes of Unity (Sentis) and Unreal (NNE) list, of what a step needs.
 ENGINES = {
-    "Add", "Cast", "Concat", "Div", "Exp", "Expand", "Gather", "Greater", "Identity", "MatMul", "Max", "Min", "Mul", "Neg", "ReduceSum",
-    "Relu", "Reshape", "Sigmoid", "Slice", "Sqrt", "Sub", "Tanh", "Transpose", "Where",
+    "Add", "Cast", "Concat", "Div", "Exp", "Expand", "Gather", "Greater", "Identity", "MatMul", "Max", "Min", "Mul", "Neg",
+    "ReduceSum", "Relu", "Reshape", "Sigmoid", "Slice", "Sqrt", "Sub", "Tanh", "Transpose", "Where",
 }  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from ncs_jax.metrics.motion import measure_motion
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.methods.method import initial_parameters
 from ncs_jax.network.rollout import animate
+from ncs_jax.prepare import build
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.prepare.mirroring import mirror_partners
 from ncs_jax.runs.run import assemble
@@ -193,7 +194,7 @@ def wander(rng, frames):
     return MotionRecord(poses, np.cumsum(0.03 * rng.normal(size=(frames, 3)), axis=0), 30.0, ())
 
 
-def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng):
+def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng, monkeypatch):
     model = ready(tmp_path)
     records = [wander(rng, n) for n in (6, 6)]
     together, alone = features_from_records(model, *records), [features_from_records(model, r) for r in records]
@@ -202,6 +203,10 @@ def test_two_motions_end_to_end_are_two_tracks(tmp_path, rng):
     for name in ("static", "dynamic", "matrices"):
         parts = np.concatenate([getattr(a, name) for a in alone])
         np.testing.assert_allclose(getattr(together, name), parts, rtol=0, atol=1e-12)
+    monkeypatch.setattr(build, "LONG", 5)
+    in_parts = features_from_records(model, *records)
+    for whole, part in zip(jax.tree.leaves(together), jax.tree.leaves(in_parts), strict=True):
+        np.testing.assert_allclose(part, whole, rtol=0, atol=1e-12)
     # though the second begins far from where the first ended, nothing is seen of the jump
     for first in (0, 6):
         np.testing.assert_array_equal(together.dynamic[first], 0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ncs_jax.network import rollout
 from ncs_jax.network.methods.method import decode, for_inference, initial_parameters
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import features_from_records
@@ -31,6 +32,16 @@ def test_alpha_zero_is_the_static_result():
     track = features_from_records(assembly.model, motion)
     static = animated(assembly.model, assembly.network, params, track, None)
     np.testing.assert_allclose(run(assembly, params, motion, 0.0), static, rtol=0, atol=1e-14)
+
+
+def test_a_long_motion_is_posed_in_parts(monkeypatch, plain_jax):
+    assembly, params, motion = ready(jnp.float32)
+    far = features_from_records(assembly.model, edited(motion, translation=motion.translation + 100))
+    whole = rollout.animated(assembly.model, assembly.network, params, far, 1.5)
+    monkeypatch.setattr(rollout, "LONG", 7)
+    parts = rollout.animated(assembly.model, assembly.network, params, far, 1.5)
+    assert parts.shape == whole.shape and whole.min() > 50
+    np.testing.assert_allclose(parts, whole, rtol=0, atol=3e-5)  # 100 m from the origin a number has 4e-6 m
 
 
 def test_prepended_rest_changes_nothing():

@@ -6,6 +6,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
@@ -21,6 +22,8 @@ __all__ = ["add_commands", "check", "tell", "tell_risk"]
 
 DRAWN = 4  # motions in the picture, at most
 NAMED = 6  # motions of a group that are named, at most
+SHOWN = 3  # risks of a kind that are printed, of more than so many
+LISTED = 20  # motions that have a line each; of more, groups of motions do
 
 
 def add_commands(commands) -> None:
@@ -50,12 +53,13 @@ def check(options) -> int:
         below = worn_below(scene)
     setting = set_up(scene, below=below, report=_say)
     _say("looking for risks")
-    risks = find_risks(setting)
+    risks = find_risks(setting, _say)
     groups = _alike(setting.motions)
     drawn = _draw(options.out, setting, _worst_first(groups, setting, risks))
     print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
-    for risk in risks:
-        tell_risk(risk)
+    _tell_risks(risks, Path(options.out).with_suffix(".risks.txt"))
+    for note in scene.motion.found:
+        tell("found", note)
     if not risks:
         tell("safe", "material, mesh, fit and motions are inside the ranges of the stability map")
     _tell_scene(setting, automatic=scene.network.cell == "auto")
@@ -70,9 +74,35 @@ def _say(words: str) -> None:
     print(f"{words} ...", file=sys.stderr, flush=True)
 
 
+def _tell_risks(risks: Sequence[Risk], file: Path) -> None:
+    """Print risks; where many motions have one of a kind, some of these, and where all of them were written."""
+    kinds: dict[str, list[Risk]] = {}
+    for risk in risks:
+        kinds.setdefault(risk.risk if risk.motion else "", []).append(risk)
+    shortened = False
+    for kind, alike in kinds.items():
+        few = alike if not kind or len(alike) <= NAMED else alike[:SHOWN]
+        for risk in few:
+            tell_risk(risk)
+        if len(few) < len(alike):
+            shortened = True
+            tell("", f"and {len(alike) - len(few)} more of this kind, in {len({risk.motion for risk in alike})} motions")
+    if shortened:
+        lines = [f"{risk.motion or '-'}\t{_words(risk)}" for risk in risks]
+        try:
+            file.write_text("motion\trisk\n" + "\n".join(lines) + "\n", encoding="utf-8")
+            tell("list", f"{file}: all {len(risks)} risks, a line each")
+        except OSError as error:  # as of the picture
+            tell("list", f"none: {type(error).__name__} {error}")
+
+
+def _words(risk: Risk) -> str:
+    return f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}"
+
+
 def tell_risk(risk: Risk) -> None:
     """Print a risk."""
-    tell("at risk", f"{risk.what}: {risk.value}: {risk.risk}; {risk.mend}")
+    tell("at risk", _words(risk))
 
 
 def tell(label: str, text: str) -> None:
@@ -137,24 +167,36 @@ def _alike(motions: dict[str, MotionRecord]) -> list[list[str]]:
 
 
 def _tell_motions(setting: Setting, groups: Sequence[Sequence[str]]) -> None:
-    """Print the motions and how they drive the body; what several have in common is printed once, after them."""
-    scene, motions = setting.scene, setting.motions
-    told = [name for group in groups if len(group) > 1 for name in group]
+    """Print the motions and how they drive the body; what several have in common is printed once, after them.
+
+    Of many motions it is how many they are, and of the kinds that drive the body unlike, the largest.
+    """
+    scene, motions, fps = setting.scene, setting.motions, setting.model.fps
+    many = len(motions) > LISTED
+    told = {name for group in groups if len(group) > 1 for name in group}
     for kind, names in (("train", scene.motion.files), ("validate", scene.motion.validation)):
+        if len(names) > LISTED:
+            frames = [len(motions[name].poses) for name in names]
+            length = f"{sum(frames)} frames at {fps:g} per second, {sum(frames) / fps / 60:.3g} minutes"
+            tell(kind, f"{len(names)} motions: {length}; {min(frames)} to {max(frames)} frames each")
+            continue
         for name in names:
-            tell(kind, f"{name}: {len(motions[name].poses)} frames at {setting.model.fps:g} per second")
+            tell(kind, f"{name}: {len(motions[name].poses)} frames at {fps:g} per second")
             for note in () if name in told else motions[name].notes:
                 tell("", note)
-            told.append(name)
-    for group in groups:
-        if len(group) == 1 or not motions[group[0]].notes:
-            continue
+            told.add(name)
+    noted = [group for group in groups if motions[group[0]].notes and (many or len(group) > 1)]
+    if many and len(noted) > NAMED:
+        noted = sorted(noted, key=len, reverse=True)
+        tell("", f"they drive the body in {len(noted)} ways, of which the {NAMED} that most have follow")
+        noted = noted[:NAMED]
+    for group in noted:
         more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
-        tell("alike", f"{len(group)} motions: {', '.join(group[:NAMED])}{more}")
+        tell("alike", f"{len(group)} motion{'s' * (len(group) > 1)}: {', '.join(group[:NAMED])}{more}")
         shared = [note for note in motions[group[0]].notes if all(note in motions[name].notes for name in group)]
         for note in shared:
             tell("", note)
-        for name in group:
+        for name in group[:1] if many else group:
             for note in motions[name].notes:
                 if note not in shared:
                     tell("", f"{name}: {note}")
@@ -164,7 +206,7 @@ def _tell_motions(setting: Setting, groups: Sequence[Sequence[str]]) -> None:
 
 def _worst_first(groups: Sequence[Sequence[str]], setting: Setting, risks: Sequence[Risk]) -> list[list[str]]:
     """Return groups of motions, and the names in each, those that a risk names first, then those that move most."""
-    risky = {name for name in setting.motions for risk in risks if re.search(re.escape(name) + r"(?![\w\[])", risk.value)}
+    risky = {risk.motion for risk in risks} | {name for name, record in setting.motions.items() if record.uncertain}
 
     def order(name: str) -> tuple[bool, float]:
         poses = setting.motions[name].poses

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +19,8 @@ __all__ = [
     "resample",
     "slerp",
 ]
+
+BLOCK = 256  # frames that are resampled together
 
 
 def axis_angle_to_quaternion(a: Float[Array, "*rows 3"]) -> Float[Array, "*rows 4"]:
@@ -101,24 +101,38 @@ def slerp(p: Float[Array, "*rows 4"], q: Float[Array, "*rows 4"], t: Float[Array
     return mixed / jnp.sqrt(jnp.sum(mixed * mixed, axis=-1, keepdims=True))
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
 def resample(
-    poses: Float[Array, "frames joints 3"],
-    translation: Float[Array, "frames 3"],
+    poses: Float[Array | np.ndarray, "frames joints 3"],
+    translation: Float[Array | np.ndarray, "frames 3"],
     source_fps: float,
     fps: float,
-) -> tuple[Float[Array, "new joints 3"], Float[Array, "new 3"]]:
-    """Resample a motion to another frame rate: rotations by slerp, translations linearly; whole ratios keep frames exactly."""
-    frames = poses.shape[0]
+) -> tuple[Float[np.ndarray, "new joints 3"], Float[np.ndarray, "new 3"]]:
+    """Resample a motion to another frame rate: rotations by slerp, translations linearly; whole ratios keep frames exactly.
+
+    It works in blocks of frames: motions of all lengths share one program, and where every frame is kept none is compiled.
+    """
+    poses, translation = np.asarray(poses), np.asarray(translation)
+    frames = len(poses)
     count = int((frames - 1) * fps / source_fps + 1e-6) + 1
-    # Times, in source frames, are known on the host: in float32 they would lose whole ratios after some hundred frames.
+    # In double precision: in single one, times would lose whole ratios after some hundred frames.
     times = np.arange(count) * source_fps / fps
     times = np.where(np.abs(times - np.round(times)) < 1e-6, np.round(times), times)
     low = np.minimum(np.floor(times).astype(np.int32), frames - 1)
     high = np.minimum(low + 1, frames - 1)
-    t = jnp.asarray(times - low, poses.dtype)[:, None]
-    q = axis_angle_to_quaternion(poses)
-    mixed = quaternion_to_axis_angle(slerp(q[low], q[high], jnp.broadcast_to(t, (count, poses.shape[1]))))
-    moved = translation[low] + t * (translation[high] - translation[low])
-    whole = jnp.asarray(times == low)[:, None, None]
-    return jnp.where(whole, poses[low], mixed), moved
+    t = (times - low).astype(poses.dtype)
+    new, between = poses[low], np.flatnonzero(times != low)
+    for first in range(0, len(between), BLOCK):
+        some = between[first : first + BLOCK]
+        at = np.pad(some, (0, BLOCK - len(some)), mode="edge")
+        new[some] = np.asarray(_between(*map(jnp.asarray, (poses[low[at]], poses[high[at]], t[at]))))[: len(some)]
+    moved = translation[low] + t[:, None].astype(translation.dtype) * (translation[high] - translation[low])
+    return new, moved
+
+
+@jax.jit
+def _between(
+    a: Float[Array, "frames joints 3"], b: Float[Array, "frames joints 3"], t: Float[Array, "frames"]
+) -> Float[Array, "frames joints 3"]:
+    """Return rotations a share t of the way from a to b, axis times angle."""
+    mixed = slerp(axis_angle_to_quaternion(a), axis_angle_to_quaternion(b), jnp.broadcast_to(t[:, None], a.shape[:2]))
+    return quaternion_to_axis_angle(mixed)

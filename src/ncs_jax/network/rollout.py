@@ -26,6 +26,7 @@ __all__ = ["Rollout", "StreamState", "animate", "animated", "first_broken", "ste
 BLOCK = 32  # garments decoded and skinned together
 LOCAL = "ncs_jax.local_rotations makes them from poses"
 PADDED = 64  # frames in whole blocks of which a motion is animated
+LONG = 4096  # frames that are posed at once, at most
 
 
 @jax.tree_util.register_dataclass
@@ -139,11 +140,35 @@ _animate = jax.jit(animate, static_argnums=1)
 def animated(model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float = 1.0) -> np.ndarray:
     """Return what `animate` returns, as NumPy.
 
-    It is compiled for whole blocks of frames, so motions of many lengths share a program.
+    It is compiled for whole blocks of frames, so motions of many lengths share a program. A motion of more than `LONG` frames
+    is posed so many at a time, and takes little more memory than its vertices.
     """
     frames = track.start.shape[0]
     padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -frames % PADDED)] + [(0, 0)] * (a.ndim - 1), mode="edge"), track)
-    return np.asarray(_animate(model, network, params, padded, float(alpha)))[:frames]
+    if frames <= LONG:
+        return np.asarray(_animate(model, network, params, padded, float(alpha)))[:frames]
+    codes, swung = _codes(model, network, params, padded, float(alpha))
+    x = np.empty((frames, *model.garment.mesh.rest.shape), model.garment.mesh.rest.dtype)
+    for first in range(0, frames, LONG):
+        at = np.minimum(np.arange(first, first + LONG), frames - 1)
+        some = None if swung is None else swung[at]
+        posed = _pose(model, network, params, track.matrices[at], codes[at], some)
+        x[first : first + LONG] = posed[: frames - first]
+    if track.origin is not None:
+        x += np.asarray(track.origin)[:, None]
+    return x
+
+
+@partial(jax.jit, static_argnums=1)
+def _codes(model: Model, network: Method, params: dict, track: MotionFeatures, alpha) -> tuple[Array, Array | None]:
+    codes = network.codes(params, model, track)
+    return codes.together(alpha), codes.swung(alpha)
+
+
+@partial(jax.jit, static_argnums=1)
+def _pose(model: Model, network: Method, params: dict, matrices: Array, codes: Array, swung: Array | None) -> Array:
+    joints, weights = len(model.skeleton.parents), garment_blend(network, params, model)
+    return _posed(model, network, params, weights, matrices[:, :joints], codes, swung)
 
 
 def first_broken(model: Model, network: Method, params: dict, track: MotionFeatures, alpha: float = 1.0) -> str:

@@ -30,30 +30,71 @@ from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
+from ncs_jax.training.shares import Shares, Stretch, shares_of
 
-__all__ = ["Assembly", "build", "features_from_records", "tell_a_person"]
+__all__ = ["Assembly", "TrainingMotions", "build", "features_from_records", "tell_a_person"]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
+LONG = 4096  # frames of which features are made at once, at most
 CELL = 8.0  # m; side of the grid from whose corners motions are measured
 
 
 @dataclass(frozen=True)
 class Assembly(Setting):
-    """A scene made ready. `training_features` are what `track` gives; `model` is whole."""
+    """A scene made ready. `training_features` are what `track` gives; `model` is whole; `training` are all training motions."""
 
     network: Method
     training_features: MotionFeatures | None
+    training: TrainingMotions | None = None
 
     @property
     def track(self) -> MotionFeatures:
         """Return all training motions end to end, in the order of the scene's files, then their mirror images if any.
+
+        Of more than `shares.SHARE` frames they are pieces from the first motion to the last, of about so many frames.
 
         Raises:
             InputError: the scene is that of a loaded run, which is made ready without them.
         """
         mend = "a loaded run has no training motions: assemble its scene, ncs_jax.assemble(run.assembly.scene)"
         return required(self.training_features, "track", mend)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingMotions:
+    """The motions that a scene trains on, in the order of its files, then their mirror images if any.
+
+    shares: of them, where they are too many to be kept as features; see `training.shares`.
+    """
+
+    records: tuple[io.MotionRecord, ...]
+    shares: Shares | None
+
+    def features(self, model: Model, pieces: Sequence[Stretch] | None) -> tuple[MotionFeatures, np.ndarray]:
+        """Return motions end to end, and the frames at which windows may end; all motions, or `pieces` of shares.
+
+        Shares have the same shapes: the character stands still in the frames after its last piece.
+        """
+        if self.shares is None or pieces is None:
+            found = features_from_records(model, *self.records)
+            return found, np.arange(len(found.start))
+        cut = [_part(self.records[piece.motion], piece.first, piece.stop) for piece in pieces]
+        lengths, leads = (np.array([of(p) for p in pieces]) for of in (lambda p: p.stop - p.first, lambda p: p.lead))
+        first = np.cumsum(lengths) - lengths
+        ends = np.concatenate([np.arange(a + lead, a + length) for a, lead, length in zip(first, leads, lengths, strict=True)])
+        if left := self.shares.size - int(lengths.sum()):
+            last = _part(cut[-1], len(cut[-1].poses) - 1)
+            cut.append(replace(last, poses=last.poses.repeat(left, 0), translation=last.translation.repeat(left, 0)))
+        found = features_from_records(model, *cut)
+        if found.origin is None:
+            found = replace(found, origin=jnp.zeros((self.shares.size, 3), found.static.dtype))
+        return found, ends
+
+
+def _part(record: io.MotionRecord, first: int, stop: int | None = None) -> io.MotionRecord:
+    """Return frames first to stop - 1 of a motion, no copies."""
+    return replace(record, poses=record.poses[first:stop], translation=record.translation[first:stop])
 
 
 def build(
@@ -81,9 +122,10 @@ def build(
     """
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
     automatic, scene = scene.network.cell == "auto", setting.scene
-    model, body, track, faces = setting.model, setting.body, None, None
+    model, body, track, faces, training = setting.model, setting.body, None, None, None
     if prepared is None:
-        track = _training_features(setting)
+        training = _training_motions(setting)
+        track, _ = training.features(model, None if training.shares is None else training.shares.spread())
     prepared = setting.prepared
     if model.body is not None and body is not None:
         faces = touchable_faces(model, body, prepared.part)
@@ -103,7 +145,7 @@ def build(
         model = replace(model, vibrations=vibrations_of(prepared, dtype) if prepared.vibrations.size else None)
     network = network_from(scene, model)
     model = model.with_terms(terms) if terms else model
-    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track)
+    return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track, training)
 
 
 def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
@@ -116,8 +158,8 @@ def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures)
     jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
-def _training_features(setting: Setting) -> MotionFeatures:
-    """Return the training motions end to end, with their mirror images if wanted; one frame at rest where there is none."""
+def _training_motions(setting: Setting) -> TrainingMotions:
+    """Return the training motions, with their mirror images if wanted; one frame at rest where there is none."""
     scene, model, body = setting.scene, setting.model, setting.body
     motions = [setting.motions[name] for name in scene.motion.files]
     if not motions:
@@ -131,7 +173,7 @@ def _training_features(setting: Setting) -> MotionFeatures:
         given = partner, axis, body.rest_rotations
         mirrored = [io.MotionRecord(*mirror(r.poses, r.translation, *given), r.fps, r.joint_names) for r in motions]
         motions = motions + mirrored
-    return features_from_records(model, *motions)
+    return TrainingMotions(tuple(motions), shares_of([len(r.poses) for r in motions], scene.training.window))
 
 
 def tell_a_person(words: str) -> None:
@@ -213,16 +255,30 @@ def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeat
     dtype = model.skeleton.joints.dtype
     lengths = [len(r.poses) for r in records]
     start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-    poses = jnp.asarray(np.concatenate([r.poses for r in records]).astype(dtype))
+    poses = np.concatenate([r.poses for r in records])
     origins = [CELL * np.round(r.translation[0].astype(np.float64) / CELL) for r in records]
     near = np.concatenate([r.translation - origin for r, origin in zip(records, origins, strict=True)])
-    found = motion_features(
-        model, local_rotations(model, poses), jnp.asarray(near.astype(dtype)), jnp.asarray(start, jnp.int32)
-    )
+    found = _in_parts(model, poses.astype(dtype), near.astype(dtype), start.astype(np.int32))
     if model.under:
         layers = jnp.concatenate([_layer_transforms(layer, records, origins, dtype) for layer in model.under], axis=1)
         found = replace(found, matrices=jnp.concatenate([found.matrices, layers], axis=1))
     return replace(found, origin=jnp.asarray(np.repeat(origins, lengths, axis=0), dtype)) if np.any(origins) else found
+
+
+def _in_parts(model: Model, poses: np.ndarray, translation: np.ndarray, start: np.ndarray) -> MotionFeatures:
+    """Return `motion_features`, of more than `LONG` frames in parts, each with the two frames before it."""
+    frames = len(start)
+    if frames <= LONG:
+        rotations = local_rotations(model, jnp.asarray(poses))
+        return motion_features(model, rotations, jnp.asarray(translation), jnp.asarray(start))
+    parts = []
+    for first in range(0, frames, LONG):
+        at = np.arange(first - 2, first + LONG).clip(0, frames - 1)
+        local = local_rotations(model, jnp.asarray(poses[at]))
+        found = motion_features(model, local, jnp.asarray(translation[at]), jnp.asarray(np.maximum(start[at] - first + 2, 0)))
+        parts.append([np.asarray(a)[2 : 2 + frames - first] for a in (found.static, found.dynamic, found.matrices)])
+    static, dynamic, matrices = (jnp.asarray(np.concatenate(each)) for each in zip(*parts, strict=True))
+    return MotionFeatures(static, dynamic, matrices, jnp.asarray(start))
 
 
 def _layer_transforms(layer: Layer, records, origins, dtype) -> Float[Array, "frames verts 3 4"]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import time
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.geometry.rotations import resample
 from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
@@ -20,11 +22,16 @@ from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
+from ncs_jax.scene.motion_lists import LISTING
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
 
-__all__ = ["lead_in_frames", "load_motion", "retarget_to_body"]
+__all__ = ["lead_in_frames", "load_motion", "load_motions", "one_by_one", "retarget_to_body"]
+
+FEW = 20  # motions that are named one by one as they are read
+EVERY = 5.0  # s between what is said of more
+NAMED = 20  # kinds of faults that are told, and files of each that are named
 
 LOOK = 10  # first frames of a file, and last, among which a T-pose is looked for
 JUMP = 3.0  # times the fastest turn of 19 in 20 frames; a first turn that is faster leaves a pose outside the motion
@@ -190,11 +197,72 @@ def _with_packaged_skeleton(motion: MotionRecord) -> MotionRecord:
     return motion
 
 
+def one_by_one(names: Collection[str], doing: str, say: Callable[[str], None]) -> Iterator[str]:
+    """Yield the names of motions; where they are many, say now and then what is done with them, and with how many already."""
+    told = time.monotonic() - EVERY
+    for number, name in enumerate(names):
+        if len(names) > FEW and time.monotonic() - told >= EVERY:
+            told = time.monotonic()
+            say(f"{doing}: {number} of {len(names)} motions")
+        yield name
+
+
+def load_motions(
+    scene: Scene, body: io.BodyRecord | None, say: Callable[[str], None]
+) -> tuple[Scene, dict[str, io.MotionRecord]]:
+    """Read all motions of a scene; return it, without those that cannot be used where it says to skip them, and the motions.
+
+    Raises:
+        InputError: some cannot be used: one of them, or all that cannot, by what is wrong.
+    """
+    names, motions, faults = list(dict.fromkeys(scene.motions)), {}, {}
+    for note in scene.motion.found:
+        say(note)
+    for name in one_by_one(names, "reading", say):
+        if len(names) <= FEW:
+            say(f"reading {name}")
+        try:
+            motions[name] = load_motion(scene, name, body)
+        except InputError as error:
+            faults[name] = error
+    if not faults:
+        return scene, motions
+    none = bool(scene.motion.files) and not any(name in motions for name in scene.motion.files)
+    if scene.motion.broken == "refuse" or none:
+        if len(faults) == 1:
+            raise next(iter(faults.values()))
+        mend = 'mend them or leave them out; motion.broken = "skip" trains without them'
+        raise InputError(
+            "motions that can be used expected", file=scene.source, field="motion", value=f"{len(faults)} of {len(names)} not",
+            mend=f"{mend}:\n{_by_kind(faults)}",
+        )  # fmt: skip
+    what = f"{len(faults)} of {len(names)} motions are left out"
+    warnings.warn(f"{what}:\n{_by_kind(faults)}", category=InputWarning, stacklevel=4)
+    files, validation = (tuple(n for n in names if n in motions) for names in (scene.motion.files, scene.motion.validation))
+    return replace(scene, motion=replace(scene.motion, files=files, validation=validation)), motions
+
+
+def _by_kind(faults: Mapping[str, InputError]) -> str:
+    """Return lines that say what is wrong with motions: what is alike but for numbers once, with the files that have it."""
+    kinds: dict[tuple[str, str], list[str]] = {}
+    for name, error in faults.items():
+        kind = re.sub(r"\d+", "#", f"{error.field}: {error.expected}"), error.mend or ""
+        kinds.setdefault(kind, []).append(name)
+    lines = []
+    for names in sorted(kinds.values(), key=len, reverse=True)[:NAMED]:
+        also = names[1 : NAMED + 1]
+        more = f" and {len(names) - 1 - len(also)} more" if len(names) > 1 + len(also) else ""
+        lines.append(f"  {faults[names[0]]}" + (f"; so too {', '.join(also)}{more}" if also else ""))
+    return "\n".join(lines) + (f"\n  and {len(kinds) - NAMED} faults of other kinds" if len(kinds) > NAMED else "")
+
+
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
     """Read a motion of the scene for its body, see `retarget_to_body`, and resample it to the scene's frame rate."""
     path, spec = scene.motion_file(name)
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
+    if path.suffix.lower() in ("", *LISTING) and not path.exists():  # else its suffix would be at fault
+        raise InputError("no such file or folder", file=path, mend="check the path")
     try:
         record = io.read_motion(path, frame_range=chosen)
         read = (
@@ -216,9 +284,8 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
     poses, translation = record.poses, record.translation
     if record.fps != scene.motion.fps:
         begin = translation[:1].astype(np.float64)
-        poses, moved = resample(
-            jnp.asarray(poses, jnp.float32), jnp.asarray(translation - begin, jnp.float32), float(record.fps), scene.motion.fps
-        )
-        translation = begin + np.asarray(moved)
+        given = poses.astype(np.float32), (translation - begin).astype(np.float32)
+        poses, moved = resample(*given, float(record.fps), scene.motion.fps)
+        translation = begin + moved
     origin, fps = (first, float(record.fps) / scene.motion.fps), scene.motion.fps
-    return replace(record, poses=np.asarray(poses), translation=np.asarray(translation), fps=fps, origin=origin)
+    return replace(record, poses=poses, translation=translation, fps=fps, origin=origin)

@@ -6,8 +6,8 @@ and nothing fails; outside them a scene is at risk. What cannot work at all is r
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ncs_jax.geometry.mesh import LINE, relative_heights
 from ncs_jax.io import MotionRecord
 from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
+from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.prepare.setting import RECURRENT, Setting
@@ -41,17 +42,20 @@ RANGES = {
 DEEP = 0.01  # m that vertices may be inside the body, where the body alone carries the garment,
 MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
+MOST = 400  # poses that are checked in all motions together
+NAMED = 6  # motions that a risk names
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
 
 
 @dataclass(frozen=True)
 class Risk:
-    """A quantity that puts a scene at risk: its name, its value here, what may happen, and the mend."""
+    """A quantity that puts a scene at risk: its name, its value here, what may happen, the mend; and the motion, if of one."""
 
     what: str
     value: str
     risk: str
     mend: str
+    motion: str = ""
 
 
 def _outside(name: str, value: float, shown: str, risk: str, mend: str) -> Iterator[Risk]:
@@ -168,24 +172,37 @@ def _inside(
         yield Risk(f"garment inside the body {when}", value, "contact pushes it out on the nearer side, right or wrong", mend)
 
 
-def _motion(a: Setting, faces: np.ndarray | None, name: str) -> Iterator[Risk]:
-    """Yield the risks of a motion: how far it goes, cloth inside the body."""
-    record = a.motions[name]
-    path = record.translation.astype(np.float64)
+def _far(a: Setting, name: str) -> Iterator[Risk]:
+    """Yield the risk of a motion that goes too far."""
+    path = a.motions[name].translation.astype(np.float64)
     far = float(np.linalg.norm(path - path[:1], axis=1).max())
     rounding = "positions are rounded to more than 0.1 mm"
-    yield from _outside("distance from the start", far, f"{far:.0f} m in {name}", rounding, "cut the motion")
-    if faces is not None:
-        frames = np.unique(np.linspace(0, len(record.poses) - 1, POSES).astype(int))
-        mend = "mend the pose, or smooth the skinning weights"
+    for risk in _outside("distance from the start", far, f"{far:.0f} m in {name}", rounding, "cut the motion"):
+        yield replace(risk, motion=name)
+
+
+def _inside_in(a: Setting, faces: np.ndarray, say: Callable[[str], None]) -> Iterator[Risk]:
+    """Yield the risks of cloth inside the body as it moves: of `POSES` of each motion, or of the most bent one of `MOST`."""
+    names = list(a.motions)
+    many = len(names) > MOST // POSES
+    if len(names) > MOST:
+        names = [names[i] for i in np.linspace(0, len(names) - 1, MOST).astype(int)]
+    mend = "mend the pose, or smooth the skinning weights"
+    which = ", in the most bent pose of each" if many else ""
+    for name in one_by_one(names, f"looking for cloth inside the body{which}", say):
+        poses = a.motions[name].poses
+        frames = np.unique(np.linspace(0, len(poses) - 1, POSES).astype(int))
+        if many:
+            frames = np.abs(poses[:, 1:]).sum(axis=(1, 2)).argmax(keepdims=True)
         when = f"where the body alone carries it in {name}"
-        yield from _inside(a, faces, record.poses[frames], when, (DEEP, MANY), mend)
+        for risk in _inside(a, faces, poses[frames], when, (DEEP, MANY), mend):
+            yield replace(risk, motion=name)
 
 
 def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
     """Yield a risk for each limb, spine or head of the body that no joint of a motion drives."""
     for limb, mend in record.undriven.items():
-        yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend)
+        yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend, name)
 
 
 def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
@@ -196,30 +213,31 @@ def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
         worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)
         mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
         risk = "they lean, or look up or down, by so much in all frames"
-        yield Risk(
-            "the pose at rest had to be built", f"right to about so many degrees: {worst}, in {', '.join(built)}", risk, mend
-        )
+        names = ", ".join([*built][:NAMED]) + (f" and {len(built) - NAMED} more" if len(built) > NAMED else "")
+        yield Risk("the pose at rest had to be built", f"right to about so many degrees: {worst}, in {names}", risk, mend)
 
 
-def _postures(a: Setting) -> Iterator[Risk]:
-    """Yield the risks of motions in which the character stands, bends or floats as nobody does."""
+def _posture(a: Setting, name: str) -> Iterator[Risk]:
+    """Yield the risks of a motion in which the character stands, bends or floats as nobody does."""
     world = "z" if np.abs(np.array(a.scene.physics.gravity)).argmax() == 2 else "y"
-    for name, record in a.motions.items():
-        for what, value, risk, mend in posture_faults(record, a.body, world) if a.body is not None else ():
-            yield Risk(what, f"{value} of {name}", risk, mend)
+    for what, value, risk, mend in posture_faults(a.motions[name], a.body, world) if a.body is not None else ():
+        yield Risk(what, f"{value} of {name}", risk, mend, name)
 
 
-def motion_risks(a: Setting) -> list[Risk]:
-    """Return what puts a scene at risk in its motions themselves, whatever is worn."""
+def motion_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[Risk]:
+    """Return what puts a scene at risk in its motions themselves, whatever is worn; `say` is told how far it is with many."""
     found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += _uncertain(a.motions)
-    found += [Risk(*fault) for name in a.motions for fault in speed_faults(a, name)]
-    return [*found, *_postures(a)]
+    for name in one_by_one(a.motions, "looking for what is too fast", say):
+        found += [Risk(*fault, name) for fault in speed_faults(a, name)]
+    for name in one_by_one(a.motions, "looking at postures", say):
+        found += _posture(a, name)
+    return found
 
 
-def find_risks(a: Setting) -> list[Risk]:
+def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[Risk]:
     """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
-    found = motion_risks(a)
+    found = motion_risks(a, say)
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
@@ -229,6 +247,5 @@ def find_risks(a: Setting) -> list[Risk]:
         below = "give it room over the garment below where it was made, or fit it with a larger ncs fit --clearance"
         mend = below if a.model.under else "push it out: ncs fit"
         found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), mend)
-    for name in a.motions:
-        found += _motion(a, faces, name)
-    return found
+    found += [risk for name in a.motions for risk in _far(a, name)]
+    return found if faces is None else [*found, *_inside_in(a, faces, say)]

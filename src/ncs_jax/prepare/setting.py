@@ -18,7 +18,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.prepare.constants import model_from
 from ncs_jax.prepare.garment_checks import check_on_body
-from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.motion_import import load_motions
 from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
 from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.scene.model import Layer, Model
@@ -64,9 +64,8 @@ def set_up(
     files = _read(scene, betas, below, dtype)
     motions: dict[str, io.MotionRecord] = {}
     if prepared is None:
-        for name in dict.fromkeys(scene.motions):
-            say(f"reading {name}")
-            motions[name] = load_motion(scene, name, files.body)
+        scene, motions = load_motions(scene, files.body, say)
+        files = replace(files, scene=scene)
         say("preparing the garment")
         prepared = replace(prepare_scene(files, [motions[name] for name in scene.motion.files]), betas=betas)
     model = model_from(files, prepared, dtype)
@@ -111,7 +110,7 @@ def _betas(scene: Scene) -> np.ndarray:
     """Return the shape of the scene's body: its own betas, or those on which all its motions agree."""
     if not isinstance(scene.body.betas, str):
         return np.array(scene.body.betas, np.float64)
-    found = {name: io.read_betas(scene.path(name)) for name in scene.motions}
+    found = {name: io.read_betas(scene.motion_file(name)[0]) for name in scene.motions}
     if not found:
         raise InputError(
             "a motion with betas expected", file=scene.source, field="body.betas", value=scene.body.betas, mend="write numbers"

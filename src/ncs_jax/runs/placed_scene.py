@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,13 +15,14 @@ from jax.tree_util import PyTreeDef
 from jaxtyping import Array
 
 from ncs_jax.energies.contact.surface import rebuild_lists
+from ncs_jax.errors import required
 from ncs_jax.network.methods.method import Method
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import Assembly
 from ncs_jax.runs.pose_stiffness import learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
-from ncs_jax.training.batches import batches
+from ncs_jax.training.batches import batches, whole_chunks
 from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
@@ -36,18 +38,21 @@ SEEN = 4  # frames that are measured between chunks
 class PlacedScene:
     """A scene made ready, on every device that trains it, and the programs that train it there.
 
-    `model` and `features` are this process's own copies. They hold the same numbers as those on the devices.
+    `model` and `features` are this process's own copies. They hold the same numbers as those on the devices. Of many motions
+    they are a share, another one after every checkpoint: see `training.shares`.
     """
 
     def __init__(self, assembly: Assembly, seed: int, programs: Programs | None = None):
         """`programs`: where some were begun already, see `begin_programs`."""
         spec = assembly.scene.training
         self.assembly, self.seed = assembly, seed
-        self.model, self.features = assembly.model, assembly.track
-        self.mesh = batch_mesh(spec.batch)
+        self.model, self.mesh = assembly.model, batch_mesh(spec.batch)
         self._programs, self._chunk, self._metrics = programs or Programs(), *_functions(assembly, self.mesh)
         self._compiled: dict[int, Compiled] = {}
-        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
+        self._every, self._number = whole_chunks(spec.checkpoint_every), -1  # steps that a share is trained on, and which it is
+        self.features: MotionFeatures
+        self._everywhere: Any  # the model and the features, with bodies
+        self._show(0)
 
     @property
     def devices(self) -> int:
@@ -88,24 +93,36 @@ class PlacedScene:
 
     def diagnose(self, state: TrainState) -> str:
         """Return why the last dropped step was dropped."""
-        return diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
+        found = diagnose(self.model, self.assembly.network, state.params, self.features, state.fault)
+        return f"{found}{self._named(int(state.fault.frame))}"
 
-    def refresh(self, params: dict) -> None:
-        """Recompute what the network adds to the motions, such as the swing: see `Method.refresh`."""
+    def _named(self, frame: int) -> str:
+        """Return in words which frame of which file a frame of a share is; nothing where there are no shares."""
+        files = self.assembly.scene.motion.files
+        for piece in self._pieces:
+            if frame < piece.stop - piece.first:
+                mirrored = ", mirrored" if piece.motion >= len(files) else ""
+                return f" (that is frame {piece.first + frame} of {files[piece.motion % len(files)]}{mirrored})"
+            frame -= piece.stop - piece.first
+        return ""
+
+    def refresh(self, params: dict, step: int) -> None:
+        """Take the motions that are trained on from a step on, and what the network adds to them: see `Method.refresh`."""
+        self._show(step // self._every)
         if self.assembly.network.refreshes:
-            told = refreshed(self.assembly.network, params, self.model, self.assembly.track)
+            told = refreshed(self.assembly.network, params, self.model, self._bare)
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
 
-    def learn_pose_stiffness(self, params: dict, steps: int) -> bool:
-        """Find how stiff the garment is in poses, of so many steps: see `runs.pose_stiffness`. Return whether it is known."""
-        learned = learn_pose_stiffness(self.assembly, params, self.assembly.track, steps, self.seed)
+    def learn_pose_stiffness(self, params: dict, done: int, steps: int) -> bool:
+        """Find how stiff the garment is in poses, after `done` of `steps`: see `runs.pose_stiffness`. Return if it is known."""
+        learned = learn_pose_stiffness(self.assembly, params, self._bare, steps, self.seed)
         if learned is self.assembly:
             return False
         self.assembly, self.model = learned, replace(self.model, vibrations=learned.model.vibrations)
         self._everywhere = self.copied(self.model), self._everywhere[1]
-        self.refresh(params)
+        self.refresh(params, done)
         return True
 
     def rebuild_lists(self, params: dict) -> None:
@@ -113,7 +130,7 @@ class PlacedScene:
         surface, terms = self.model.surface, self.model.terms
         if surface is None or terms.collision != "plane" or not terms.exact:
             return
-        motions = self.assembly.track
+        motions = self._bare
         some = np.unique(np.linspace(0, motions.start.shape[0] - 1, SAMPLED).astype(int))
         part = replace(jax.tree.map(lambda a: a[some], motions), origin=None)
         cloth, body = map(np.asarray, _garment_and_body(self.model, self.assembly.network, params, part))
@@ -121,8 +138,26 @@ class PlacedScene:
         self.model = replace(self.model, surface=surface)
         self._everywhere = self.copied(self.model), self._everywhere[1]
 
+    def _show(self, number: int) -> None:
+        """Place the motions of a share, or all of them where they are few."""
+        training, spec = required(self.assembly.training, "training"), self.assembly.scene.training
+        if number == self._number or (training.shares is None and self._number >= 0):
+            return
+        self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
+        if training.shares is None:
+            self._bare, self._last = self.assembly.track, np.arange(len(self.assembly.track.start))
+        else:
+            self._everywhere = None  # before the next one takes as much memory
+            self._bare, self._last = training.features(self.assembly.model, self._pieces)
+        self.features = self._bare
+        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
+
     def _ends(self, first: int, count: int) -> np.ndarray:
-        return batches(self.features.start.shape[0], self.assembly.scene.training.batch, self.seed, first, count)
+        """Return the last frames of the windows of some steps, (count, batch)."""
+        seed, batch = self.seed, self.assembly.scene.training.batch
+        if required(self.assembly.training, "training").shares is not None:
+            seed, first = int(np.random.SeedSequence([seed, 3, self._number]).generate_state(1)[0]), first % self._every
+        return self._last[batches(len(self._last), batch, seed, first, count)]
 
     def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
         ends = self._ends(first, count)

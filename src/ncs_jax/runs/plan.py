@@ -5,16 +5,17 @@ from __future__ import annotations
 import time
 from bisect import bisect_right
 from collections.abc import Callable
+from itertools import cycle
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from ncs_jax.runs.placed_scene import PlacedScene
-from ncs_jax.training.batches import CHUNK
+from ncs_jax.training.batches import CHUNK, whole_chunks
 from ncs_jax.training.step import TrainState
 
-__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within", "whole_chunks"]
+__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within"]
 
 ENOUGH = 300  # steps; after fewer, a garment still looks as it did at the start
 EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
@@ -59,8 +60,10 @@ def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[],
     """
     spec = placed.assembly.scene.training
 
+    begins = cycle((int(state.step) + whole_chunks(spec.checkpoint_every), int(state.step)))  # of another share each time
+
     def lists() -> None:
-        placed.refresh(state.params)
+        placed.refresh(state.params, next(begins))
         placed.rebuild_lists(state.params)
 
     def chunk() -> None:
@@ -88,8 +91,3 @@ def _seconds(work: Callable[[], object]) -> float:
     start = time.monotonic()
     work()
     return time.monotonic() - start
-
-
-def whole_chunks(steps: int) -> int:
-    """Return the next multiple of CHUNK."""
-    return -(-steps // CHUNK) * CHUNK

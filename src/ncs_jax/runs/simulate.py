@@ -31,7 +31,8 @@ from ncs_jax.simulation.solver.minimise import Settings, Solution
 
 __all__ = ["Progress", "Trajectory", "simulate"]
 
-SAVE_EVERY = 10.0  # s
+SAVE_EVERY = 10.0  # s, at least,
+SHARE = 20  # and so many times as long as it takes to save
 TURN = (0.3, 0.5, 0.7)
 
 
@@ -162,7 +163,8 @@ def _simulated(
     if partial is not None and Path(partial).exists():
         done, state = _continued(Path(partial), identity, done, state)
     rows: dict[str, list] = {key: list(values) for key, values in done.items()}
-    begun = saved = time.monotonic()
+    begun, pause = time.monotonic(), SAVE_EVERY
+    saved = begun
     first = len(rows["status"])
     if first < frames:
         if report is None:
@@ -184,13 +186,14 @@ def _simulated(
         if report is not None:
             left = (now - begun) / (t + 1 - first) * (frames - 1 - t)
             report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
-        if partial is not None and now - saved > SAVE_EVERY and t + 1 < frames:
+        if partial is not None and now - saved > pause and t + 1 < frames:
             arrays = {key: np.asarray(values) for key, values in rows.items()}
             write_npz(partial, **_kept(state), identity=np.asarray(identity), **arrays)
             saved = time.monotonic()
+            pause = max(SAVE_EVERY, SHARE * (saved - now))  # of a long motion a file takes long
     arrays = {key: np.asarray(values) for key, values in rows.items()}
-    shown = jax.tree.map(lambda a: a[:: spec.substeps], track)
-    arrays["vertices"] = np.asarray(shown.absolute(jnp.asarray(arrays["vertices"])))
+    if track.origin is not None:
+        arrays["vertices"] += np.asarray(track.origin)[:: spec.substeps, None]
     return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
 
 

@@ -24,10 +24,10 @@ from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
-from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
+from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within
 from ncs_jax.runs.run import NetworkMaker, Run, assemble, load_run, own_names
 from ncs_jax.scene.spec import Scene, load_scene
-from ncs_jax.training.batches import CHUNK, chunks
+from ncs_jax.training.batches import CHUNK, chunks, whole_chunks
 from ncs_jax.training.devices import trim_memory
 from ncs_jax.training.programs import Programs
 from ncs_jax.training.step import TrainState
@@ -88,7 +88,7 @@ def train(
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
     state = placed.initial_state(params)
-    placed.refresh(state.params)
+    placed.refresh(state.params, 0)
     if facts is None:  # before anything is written: whether it fits into memory
         placed.compile(state, first)
         facts = {"steps": 0, **own_names(terms, network)} | ({"start": str(start)} if start else {})
@@ -213,7 +213,7 @@ class _Loop:
     def run(self) -> Run:
         """Take every step that is left, and return the trained garment."""
         placed = self._placed
-        placed.refresh(placed.local(self._state.params))
+        placed.refresh(placed.local(self._state.params), self._first)
         if self._first:
             placed.rebuild_lists(placed.local(self._state.params))
         self._output.begin_log(self._first)
@@ -226,7 +226,9 @@ class _Loop:
         placed, done = self._placed, at + count
         self._state, logs = placed.run_chunk(self._state, at, count, self._steps)
         here, logs = placed.local((self._state, logs))
-        if done in (whole_chunks(self._steps // 2), self._steps) and placed.learn_pose_stiffness(here.params, self._steps):
+        if done in (whole_chunks(self._steps // 2), self._steps) and placed.learn_pose_stiffness(
+            here.params, done, self._steps
+        ):
             self._output.keep(done, placed.assembly)
         if self._timed is None:  # this chunk was compiled
             trim_memory()
@@ -240,7 +242,7 @@ class _Loop:
         if whole or done == self._steps:
             self._output.save(done, here)
         if whole:  # where a run that is resumed begins
-            placed.refresh(here.params)
+            placed.refresh(here.params, done)
         if whole or (done in EARLY and done < self._every):
             placed.rebuild_lists(here.params)
 

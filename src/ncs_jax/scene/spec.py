@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
 import tomllib
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_jax.errors import InputError
+from ncs_jax.scene.motion_lists import each_motion
 from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
 
 __all__ = [
@@ -98,7 +100,9 @@ class GarmentSpec:
 class MotionSpec:
     """[motion]: what the character does."""
 
-    files: tuple[str, ...] = _f(("ncs:walk",), "motions to train on, FILE or FILE[10:300]; empty: the character stands still")
+    files: tuple[str, ...] = _f(
+        ("ncs:walk",), "motions to train on: FILE, FILE[10:300], FOLDER, *.bvh, LIST.txt; empty: the character stands still"
+    )
     validation: tuple[str, ...] = _f((), "motions to validate on, not to train on")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
     mirror: bool = _f(False, "train on the mirror image of every motion too")
@@ -113,7 +117,9 @@ class MotionSpec:
     joints: dict[str, str] = _f(
         {}, 'the body\'s joint for a joint of a motion, where names do not tell; "" for none', each=True
     )
+    broken: str = _f("refuse", "motions that cannot be used: refuse the scene; or skip them", choices=("refuse", "skip"))
     own: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})  # by motion, what its table says
+    found: tuple[str, ...] = field(default=(), metadata={"internal": True})  # in words, what names of many motions stand for
 
 
 @dataclass(frozen=True)
@@ -266,7 +272,7 @@ class Scene:
         tables["body"]["file"] = absolute(tables["body"]["file"])
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
         tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
-        own = tables["motion"].pop("own")
+        own, _ = tables["motion"].pop("own"), tables["motion"].pop("found")
         for key in LISTS:
             given = [(name, split_frames(name)[0]) for name in tables["motion"][key]]
             tables["motion"][key] = [
@@ -335,7 +341,6 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         motion, own = named_motions(motion, source or "scene", check, each)
         tables = {**tables, "motion": motion}
     scene = _parse(Scene, tables, source or "scene", "")
-    scene = dataclasses.replace(scene, motion=dataclasses.replace(scene.motion, own=own))
     gravity = scene.physics.gravity
     if len(gravity) != 3:
         raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
@@ -348,7 +353,10 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         raise InputError("an even last size expected", file=source, field="network.static", value=list(scene.network.static))
     if scene.garment.file in ("", "none"):
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
-    return dataclasses.replace(scene, source=source)
+    scene = dataclasses.replace(scene, source=source)
+    found = each_motion({key: getattr(scene.motion, key) for key in LISTS}, own, scene.path, source)
+    motion = dataclasses.replace(scene.motion, files=found.files, validation=found.validation, own=found.own, found=found.told)
+    return dataclasses.replace(scene, motion=motion)
 
 
 def template() -> str:
@@ -384,7 +392,7 @@ def _parse(cls, tables, source: str, where: str):
     fields = {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
     for key in tables:
         if key not in fields:
-            near = _nearest(key, fields)
+            near = next(iter(difflib.get_close_matches(key, list(fields), n=1)), "")
             raise InputError(
                 "unknown key",
                 file=source,
@@ -440,10 +448,3 @@ def _value(kind, value, meta, source, where):
             bounds = f"a number {'above' if meta['above'] else 'from'} {low:g} {'up ' if meta['above'] else ''}to {high:g}"
             raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value)
     return kind(value)
-
-
-def _nearest(key: str, names) -> str:
-    """Return the name that is most like a key, empty where none is."""
-    import difflib
-
-    return next(iter(difflib.get_close_matches(key, list(names), n=1)), "")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-__all__ = ["CHUNK", "batches", "chunks"]
+__all__ = ["CHUNK", "batches", "chunks", "whole_chunks"]
 
 
 CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
@@ -22,6 +22,11 @@ def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.nd
     shuffled = {r: np.random.default_rng([seed, int(r)]).permutation(frames) for r in np.unique(rounds)}
     picked = np.stack([shuffled[r][i] for r, i in zip(rounds, wanted % frames, strict=True)])
     return picked.reshape(count, batch).astype(np.int32)
+
+
+def whole_chunks(steps: int) -> int:
+    """Return the next multiple of CHUNK."""
+    return -(-steps // CHUNK) * CHUNK
 
 
 def chunks(first: int, steps: int) -> Iterator[tuple[int, int]]:

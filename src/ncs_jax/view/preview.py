@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +24,7 @@ ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
 BARE = 1.0  # mm outside the cloth, from which skin is said to show
+NAMED = 8  # motions that a run trained on which the page names
 MEASURED = 24  # frames, at most, of which strain and penetration are measured
 
 
@@ -80,7 +81,7 @@ def preview(
         f"{alpha:g}": animation if alpha == shown else replace(animation, garment=run.animate(track, alpha))
         for alpha in (ALPHAS if controlled else (0.0,))
     }
-    facts = {"motion": names[0], "trained": f"{run.steps} steps on {', '.join(scene.motion.files)}"}
+    facts = {"motion": names[0], "trained": f"{run.steps} steps on {_some(scene.motion.files)}"}
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
     write(facts=facts)
 
@@ -96,6 +97,12 @@ def preview(
     write(facts=facts | _facts_of(quantities))
     tell(PreviewStep(None, "done", 1.0))
     return quantities
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
 
 
 def _facts_of(quantities: dict[str, float]) -> dict[str, str]:

@@ -45,6 +45,7 @@ from ncs_jax.network.methods.method import (
     garment_blend,
     static_code_size,
 )
+from ncs_jax.network.methods.modal_mass import constants, modal_mass, pulled, rotations_of
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes, pose_garment
 
@@ -136,15 +137,20 @@ class Swing:
         # A block with the two frames before it, of which those before a motion's start are that start.
         seen = np.clip(np.arange(0, frames, block)[:, None] + np.arange(-2, block), 0, frames - 1)
 
+        weights, directions, mass = garment_blend(self, params, model), _vibrations(model).directions, _mass(model)
+        known = constants(directions, mass, weights)
+
         def sums(args):
             z, matrices, number, start, static = args
-            s, p = self._static_garment(params, model, z, jnp.moveaxis(matrices, 0, -1))
-            (s, s1, s2), (p, p1, p2) = ([a[..., 2 - k : block + 2 - k] for k in range(3)] for a in (s, p))
+            matrices = jnp.moveaxis(matrices, 0, -1)
+            s, axes = pose_garment(model, decode(self, params, model, z), matrices, weights), rotations_of(matrices, weights)
+            (s, s1, s2), (r, r1, r2) = ([a[..., 2 - k : block + 2 - k] for k in range(3)] for a in (s, axes))
             one, two = ((number[2:] - k >= start[2:])[None, None] for k in (1, 2))
             s1, s2 = jnp.where(one, s1, s), jnp.where(two, s2, jnp.where(one, s1, s))
-            p1, p2 = jnp.where(one[None], p1, 0), jnp.where(two[None], p2, 0)
-            found = _product(model, p, p), _product(model, p, p1), _product(model, p, p2), _push(model, p, s - 2 * s1 + s2)
-            *products, push = found
+            r1, r2 = jnp.where(one, r1, 0), jnp.where(two, r2, 0)
+            products = [modal_mass(known, r, past) for past in (r, r1, r2)]
+            force = mass[:, None, None] * (s - 2 * s1 + s2)
+            push = pulled(directions, blend(matrices[..., 2:], weights), force)
             inverse = _inverse(self._system(model, products[0], stiffness(_vibrations(model), static)))
             return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (inverse, *products, push))
 
