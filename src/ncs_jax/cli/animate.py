@@ -89,6 +89,7 @@ def animate(options) -> int:
 
 def _run_and_motion(options) -> tuple[Run, MotionRecord]:
     """Return the run to animate, adapted if that is asked for, and the first of its motions, read once."""
+    from ncs_jax.cli.check import tell_beyond
     from ncs_jax.runs.run import load_run
 
     if options.adapt is None and (len(options.motion) > 1 or options.adapted):
@@ -104,6 +105,7 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
         _tell_motions(run.assembly)
     if options.adapt is not None:
         run = adapted(run, motions, options).run
+    tell_beyond(run.coverage(records[motions[0]]))
     return run, records[motions[0]]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ncs_jax.cli import arguments
+from ncs_jax.cli.check import tell_beyond
 from ncs_jax.cli.train import adapted
 from ncs_jax.errors import InputError
 
@@ -42,6 +43,7 @@ def view(options) -> int:
         host=options.host,
         port=options.port,
     )
+    tell_beyond(window.coverage, window.subject.motions[0])
     print(f"{window.address}  (over SSH: ssh -L {options.port}:localhost:{options.port} HOST; Ctrl-C ends it)", flush=True)
     try:
         window.wait()

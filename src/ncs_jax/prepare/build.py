@@ -30,7 +30,7 @@ from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
 
-__all__ = ["Assembly", "build", "features_from_records", "tell_a_person"]
+__all__ = ["Assembly", "build", "features_from_records", "tell_a_person", "training_features"]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
@@ -82,7 +82,7 @@ def build(
     automatic, scene = scene.network.cell == "auto", setting.scene
     model, body, track, faces = setting.model, setting.body, None, None
     if prepared is None:
-        track = _training_features(setting)
+        track = training_features(setting)
     prepared = setting.prepared
     if model.body is not None and body is not None:
         faces = touchable_faces(model, body, prepared.part)
@@ -115,7 +115,7 @@ def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures)
     jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
-def _training_features(setting: Setting) -> MotionFeatures:
+def training_features(setting: Setting) -> MotionFeatures:
     """Return the training motions end to end, with their mirror images if wanted; one frame at rest where there is none."""
     scene, model, body = setting.scene, setting.model, setting.body
     motions = [setting.motions[name] for name in scene.motion.files]

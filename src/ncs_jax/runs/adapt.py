@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -27,7 +26,7 @@ from ncs_jax.metrics.quality import summarise
 from ncs_jax.prepare.build import Assembly, features_from_records
 from ncs_jax.prepare.touchable import covered_by_layers, touchable, touchable_part
 from ncs_jax.runs.begin import unread_joints
-from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, write_run
+from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, read_trained, write_run
 from ncs_jax.runs.log import Report
 from ncs_jax.runs.placed_scene import begin_programs
 from ncs_jax.runs.run import Run, assemble, load_run
@@ -116,58 +115,58 @@ def adapt(
         raise InputError("a number of seconds above 0 expected", field="seconds", value=seconds)
     out, say = None if out is None else Path(out), say or (lambda words: None)
     scene, records = _scene_on(run, motions)
-    names = list(records)
-    about = {"motions": names, "of": _digest(run, list(records.values()))}
+    about = {"motions": list(records), "of": _digest(run, list(records.values()))}
     facts = _facts_of(out, about)
-    begins = replace(run, assembly=_assembly_on(run, scene, records))
-    standing = _standing(out, facts, begins)
-    if facts is not None and standing is not None and standing.spent >= seconds and "after" in facts["adapted"]:
-        told = facts["adapted"]
-        now = replace(begins, params=standing.params, steps=standing.steps)
+    begins = replace(run, assembly=_assembly_on(run, scene, records), steps=0, trained=None)
+    now, spent = _standing(out, facts, begins)
+    told = {} if facts is None else facts["adapted"]
+    if spent >= seconds and "after" in told:
+        now = replace(now, trained=read_trained(out) if out is not None else None)
         return Adapted(now, told["before"], told["after"], told["seconds"], told["kept"], out)
     programs = Programs()
     begin_programs(programs, begins.assembly, CHUNK)  # while it is measured
-    say("measuring the garment on " + ", ".join(names))
-    own = _measured(begins) if facts is None else facts["adapted"]["before"]
-    found = [(own, run.params)]
-    if standing is not None and standing.steps:
-        found.append((_measured(replace(begins, params=standing.params)), standing.params))
-
-    def settle(params: dict) -> dict:
-        found.append((_measured(replace(begins, params=params)), params))
-        return min(found, key=lambda one: one[0]["total"])[1]
-
-    told = {**about, "seconds": seconds, "before": own}
+    say("measuring the garment on " + ", ".join(records))
+    best = _Best(begins, told.get("before"))
+    if now.steps:
+        best(now.params)
+    told = {**about, "seconds": seconds, "before": best.before}
     said = {"start": str(Path(run.assembly.scene.source).parent), **_own_facts(run, out), "adapted": told}
-    begun = Begun(None if facts is None else facts | said, said, run.params, begins.assembly.scene.training.seed, since)
-    left = (seconds - (standing.spent if standing is not None else 0)) / 60
+    begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since, run.known())
+    left = None, (seconds - spent) / 60
     say("compiling")
-    adapted = train_assembly(begins.assembly, out, begun, (None, left), programs=programs, report=report, settle=settle)
-    after, _ = min(found, key=lambda one: one[0]["total"])
-    kept = after is not own
+    adapted = train_assembly(begins.assembly, out, begun, left, programs=programs, report=report, settle=best)
+    told |= {"after": best.measures, "kept": best.measures is not best.before}
     if out is not None:
-        write_run(out, read_run(out) | {"adapted": told | {"after": after, "kept": kept}})
-    return Adapted(adapted, own, after, seconds, kept, out)
+        write_run(out, read_run(out) | {"adapted": told})
+    return Adapted(adapted, best.before, best.measures, seconds, told["kept"], out)
 
 
-class _Standing(NamedTuple):
-    """Where an adaptation stands: its weights, after so many steps, in which so many seconds were spent."""
+class _Best:
+    """The weights that have the least energy on the motions of a scene, of those that it is called with; and `measures`."""
 
-    params: dict
-    steps: int
-    spent: float
+    def __init__(self, run: Run, measures: dict[str, float] | None):
+        """Begin with those of a run, and what is measured of it if that is known."""
+        self._run, self._params, self.before = run, run.params, measures or _measured(run)
+        self.measures = self.before
+
+    def __call__(self, params: dict) -> dict:
+        """Return the best weights, these included; of equal ones the first."""
+        measures = _measured(replace(self._run, params=params))
+        if measures["total"] < self.measures["total"]:
+            self._params, self.measures = params, measures
+        return self._params
 
 
-def _standing(out: Path | None, facts: dict | None, run: Run) -> _Standing | None:
-    """Return where the adaptation in a folder stands, None where there is none."""
+def _standing(out: Path | None, facts: dict | None, begins: Run) -> tuple[Run, float]:
+    """Return the run as its adaptation in a folder stands, and how many seconds were spent on it."""
     if out is None or facts is None:
-        return None
-    checkpoints = Checkpoints(out)
+        return begins, 0.0
+    checkpoints, a = Checkpoints(out), begins.assembly
     steps = checkpoints.latest()
     if steps is None:
         raise InputError("no checkpoint there yet", file=out, mend="delete this folder")
-    like = jax.eval_shape(lambda: initial_state(run.assembly.model, run.assembly.network, 0))
-    return _Standing(checkpoints.restore(like).params, steps, facts["adapted"]["seconds"] * (steps / max(facts["steps"], 1)))
+    state = checkpoints.restore(jax.eval_shape(lambda: initial_state(a.model, a.network, 0)))
+    return replace(begins, params=state.params, steps=steps), facts["adapted"]["seconds"] * (steps / max(facts["steps"], 1))
 
 
 def _facts_of(out: Path | None, about: dict) -> dict | None:

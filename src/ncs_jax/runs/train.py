@@ -20,10 +20,11 @@ import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
+from ncs_jax.metrics.coverage import TrainedMotion, trained_motion
 from ncs_jax.metrics.quality import summarise
 from ncs_jax.prepare.build import Assembly
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
-from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
+from ncs_jax.runs.checkpoint import Checkpoints, read_trained, write_prepared, write_run, write_trained
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
 from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within, whole_chunks
@@ -95,7 +96,8 @@ def train(
 class Begun(NamedTuple):
     """Where a training begins: what run.json says of the run that is resumed, None of a new one; what else it is to say.
 
-    `params`: weights of another run, if it begins with some. `since`: when it was called for, s.
+    `params`: weights of another run, if it begins with some. `since`: when it was called for, s. `trained`: what these weights
+    still know.
     """
 
     facts: dict | None
@@ -103,6 +105,7 @@ class Begun(NamedTuple):
     params: dict | None
     seed: int
     since: float
+    trained: TrainedMotion | None = None
 
 
 def train_assembly(
@@ -134,8 +137,9 @@ def train_assembly(
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
         last = _planned(placed, output, state, steps, minutes)
+        trained = output.keep(begun.trained)
         loop = _Loop(placed, output, placed.copied(state), last, begun.since, settle)
-        return Run(assembly, loop.run(), last)
+        return Run(assembly, loop.run(), last, trained=trained)
 
 
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
@@ -185,6 +189,16 @@ class _Output:
             scene = self._placed.assembly.scene.to_dict()
             facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
             write_run(self._out, facts)
+
+    def keep(self, known: TrainedMotion | None) -> TrainedMotion:
+        """Return what the run is trained on, beside what its first weights know; write it down if that was not done."""
+        if self._out is not None and (there := read_trained(self._out)) is not None:
+            return there
+        trained = trained_motion(self._placed.assembly.model, self._placed.assembly.track)
+        trained = trained if known is None else trained.merged(known)
+        if self._out is not None:
+            write_trained(self._out, trained)
+        return trained
 
     @property
     def started(self) -> bool:
