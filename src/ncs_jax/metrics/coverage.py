@@ -17,12 +17,12 @@ from ncs_jax.scene.model import Model
 
 __all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "trained_motion"]
 
-FAR = 0.22  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
+FAR = 0.2  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
 FAST = 2.0  # times the largest trained rate, and twice as much of the accelerations, are the limit
 GROWTH = 1.4  # power of the distance with which the energy rises beyond
 TOLD = 0.1  # of the energy, above which a motion is told to be beyond
 CARRIED = 0.005  # of the garment, that a joint and those below it carry at least, if it counts
-KEPT = 256  # poses of a joint, at most
+KEPT = 1024  # poses of a joint, at most
 CLOSE = 0.03  # distance within which every trained pose of a joint has a kept one, if there are no more than `KEPT`
 SEEN = 8192  # frames that are looked at, at most
 STILL = 0.1, 0.5  # 1/s, m/s^2: least limits of rates and accelerations
@@ -37,19 +37,15 @@ class TrainedMotion:
         poses: (kept, 9) of each joint, those that are farthest from each other: the first two columns of its rotation since its
             parent, zeros for the root of a network that is free of its heading, and the direction of gravity that it sees.
         joint: (kept,) of which joint each is, of those that carry the garment.
+        radius: (joints,) how far 19 of 20 trained poses are from the nearest kept one, at most.
         rates: (joints,) the largest rate of such a pose, 1/s. accelerations: (joints,) of each joint, m/s^2.
     """
 
     poses: Float[np.ndarray, "kept 9"]
     joint: np.ndarray
+    radius: Float[np.ndarray, "joints"]
     rates: Float[np.ndarray, "joints"]
     accelerations: Float[np.ndarray, "joints"]
-
-    def merged(self, other: TrainedMotion) -> TrainedMotion:
-        """Return this and other motions together."""
-        poses, joint = np.concatenate([self.poses, other.poses]), np.concatenate([self.joint, other.joint])
-        rates = np.maximum(self.rates, other.rates)
-        return TrainedMotion(poses, joint, rates, np.maximum(self.accelerations, other.accelerations))
 
 
 @dataclass(frozen=True)
@@ -114,13 +110,15 @@ class Coverage:
 
 
 def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
-    """Return what a run keeps of the motions in a track: 256 poses of each joint at most, and the largest speeds."""
+    """Return what a run keeps of the motions in a track: 1,024 poses of each joint at most, and the largest speeds."""
     poses, rates, accelerations = _described(model, track)
     joints = range(poses.shape[1])
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), SEEN)).astype(int))
-    kept = [poses[some, j][_spread(poses[some, j])] for j in joints]
-    joint = np.repeat(joints, [len(k) for k in kept])
-    return TrainedMotion(np.concatenate(kept).astype(np.float16), joint, rates.max(axis=0), accelerations.max(axis=0))
+    spread = [_spread(poses[some, j]) for j in joints]
+    kept = np.concatenate([poses[some[chosen], j] for j, (chosen, _) in zip(joints, spread, strict=True)])
+    joint = np.repeat(np.array(joints, np.int16), [len(chosen) for chosen, _ in spread])
+    radius = np.array([np.percentile(far, 95) for _, far in spread])
+    return TrainedMotion(kept.astype(np.float16), joint, radius, rates.max(axis=0), accelerations.max(axis=0))
 
 
 def coverage(
@@ -128,14 +126,15 @@ def coverage(
 ) -> Coverage:
     """Return how far the frames of a track are from what a run was trained on.
 
-    For each joint it is the distance |d_t - d_k| to the nearest kept pose, over `FAR`, and its rate and acceleration over the
-    largest trained ones, times `FAST` and twice that.
+    For each joint it is the distance |d_t - d_k| to the nearest kept pose, less how far trained ones are, over `FAR`, and its
+    rate and acceleration over the largest trained ones, times `FAST` and twice that.
 
     Args:
         names: of the body's joints; their numbers where there are none. moving: whether the network reads speeds at all.
     """
     poses, rates, accelerations = _described(model, track)
-    far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1) / FAR
+    far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1)
+    far = np.maximum(far - trained.radius, 0) / FAR
     fast = rates / np.maximum(FAST * trained.rates, STILL[0])
     fast = np.maximum(fast, accelerations / np.maximum(2 * FAST * trained.accelerations, STILL[1]))
     numbers = [model.source_joints[j] for j in _carrying(model)]
@@ -177,13 +176,19 @@ def _described(model: Model, track: MotionFeatures) -> tuple[np.ndarray, np.ndar
     return poses, rates, accelerations
 
 
-def _spread(poses: np.ndarray) -> np.ndarray:
-    """Return the numbers of poses (frames, 9) that are far from each other: each in turn the one farthest from those before."""
-    chosen, far = [0], np.linalg.norm(poses - poses[0], axis=1)
-    while far.max() > CLOSE and len(chosen) < KEPT:
+def _spread(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of poses (frames, 9) that are far from each other, and how far each pose is from the nearest of them.
+
+    Each in turn is the one that is farthest from those before.
+    """
+    columns = np.ascontiguousarray(poses.T, np.float32)
+    chosen, far = [0], np.full(len(poses), np.inf, np.float32)
+    while True:
+        away = columns - columns[:, chosen[-1], None]
+        np.minimum(far, np.einsum("it,it->t", away, away), out=far)
+        if far.max() <= CLOSE**2 or len(chosen) == KEPT:
+            return np.array(chosen), np.sqrt(far)
         chosen.append(int(far.argmax()))
-        far = np.minimum(far, np.linalg.norm(poses - poses[chosen[-1]], axis=1))
-    return np.array(chosen)
 
 
 def _nearest(poses: np.ndarray, kept: np.ndarray) -> np.ndarray:

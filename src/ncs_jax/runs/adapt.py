@@ -39,7 +39,6 @@ from ncs_jax.training.step import initial_state
 
 __all__ = ["Adapted", "adapt", "adapted_folder"]
 
-RATE = 0.5  # of the scene's learning rate, to begin with
 AUGMENTED = 0.25  # share of a batch that gets another frame's swing
 FILLED = 512  # frames in whole blocks of which a clip is trained on, so that clips of many lengths share their programs
 NEAR = 0.03  # m; skin that comes so near to the garment, as the body carries it, is touched
@@ -94,6 +93,8 @@ def adapt(
 ) -> Adapted:
     """Go on training a run on motions alone, for some seconds from the first step on; keep the weights that are better there.
 
+    It is for these motions: what the run knew of others, it forgets.
+
         adapted = ncs_jax.adapt("runs/tshirt", "dance.bvh", seconds=20)
         vertices = adapted.run.animate("dance.bvh")
 
@@ -103,7 +104,7 @@ def adapt(
         out: run folder to keep it in, as `adapted_folder` names it, for example; None keeps nothing.
         report, say: see `runs.train.train`; KeyboardInterrupt from `report` ends it with a checkpoint, from which it goes on.
 
-    The learning rate begins at half of the scene's, and the optimiser anew. Which skin the garment can touch is found again
+    Learning rate and optimiser begin anew. Which skin the garment can touch is found again
     where the motions bring other skin near it.
 
     Raises:
@@ -131,7 +132,7 @@ def adapt(
         best(now.params)
     told = {**about, "seconds": seconds, "before": best.before}
     said = {"start": str(Path(run.assembly.scene.source).parent), **_own_facts(run, out), "adapted": told}
-    begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since, run.known())
+    begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since)
     left = None, (seconds - spent) / 60
     say("compiling")
     adapted = train_assembly(begins.assembly, out, begun, left, programs=programs, report=report, settle=best)
@@ -217,8 +218,7 @@ def _scene_on(run: Run, motions: str | Sequence[str]) -> tuple[Scene, dict[str, 
         records[whole] = run.motion(name)
         own |= {whole: scene.motion.own[name]} if name in scene.motion.own else {}
     motion = replace(scene.motion, files=tuple(records), validation=(), mirror=False, own=own)
-    training, rate = scene.training, RATE * scene.training.learning_rate
-    training = replace(training, learning_rate=rate, motion_augmentation=min(AUGMENTED, training.motion_augmentation))
+    training = replace(scene.training, motion_augmentation=min(AUGMENTED, scene.training.motion_augmentation))
     return replace(scene, motion=motion, training=training), records
 
 

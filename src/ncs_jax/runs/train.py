@@ -96,8 +96,7 @@ def train(
 class Begun(NamedTuple):
     """Where a training begins: what run.json says of the run that is resumed, None of a new one; what else it is to say.
 
-    `params`: weights of another run, if it begins with some. `since`: when it was called for, s. `trained`: what these weights
-    still know.
+    `params`: weights of another run, if it begins with some. `since`: when it was called for, s.
     """
 
     facts: dict | None
@@ -105,7 +104,6 @@ class Begun(NamedTuple):
     params: dict | None
     seed: int
     since: float
-    trained: TrainedMotion | None = None
 
 
 def train_assembly(
@@ -137,7 +135,7 @@ def train_assembly(
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
         last = _planned(placed, output, state, steps, minutes)
-        trained = output.keep(begun.trained)
+        trained = output.keep()
         loop = _Loop(placed, output, placed.copied(state), last, begun.since, settle)
         return Run(assembly, loop.run(), last, trained=trained)
 
@@ -190,12 +188,11 @@ class _Output:
             facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
             write_run(self._out, facts)
 
-    def keep(self, known: TrainedMotion | None) -> TrainedMotion:
-        """Return what the run is trained on, beside what its first weights know; write it down if that was not done."""
+    def keep(self) -> TrainedMotion:
+        """Return what the run is trained on, and write it down if that was not done."""
         if self._out is not None and (there := read_trained(self._out)) is not None:
             return there
         trained = trained_motion(self._placed.assembly.model, self._placed.assembly.track)
-        trained = trained if known is None else trained.merged(known)
         if self._out is not None:
             write_trained(self._out, trained)
         return trained
