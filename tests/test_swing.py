@@ -18,7 +18,7 @@ from ncs_jax.network.methods.swing import QUIET, Swing, stiffness
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import BEYOND, features_from_records
 from ncs_jax.prepare.setting import with_cell
-from ncs_jax.runs.pose_stiffness import fitted
+from ncs_jax.runs.pose_stiffness import FEWEST, fitted
 from ncs_jax.scene.model import RitzModes, local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
@@ -357,7 +357,7 @@ def test_what_is_fitted_is_a_map_of_the_descriptors_and_keeps_to_what_was_found(
     bad = np.array(given)
     bad[3], bad[4] = np.nan, -bad[4]
     np.testing.assert_allclose(fitted(d, bad)[:5], a, atol=1e-3)
-    assert fitted(d[:9], bad[:9]) is None  # seven are left
+    assert fitted(d[: FEWEST + 1], bad[: FEWEST + 1]) is None  # two are of no use
     far = told(jnp.asarray(by_pose), 100 * d)  # what no training has shown is no softer and no stiffer than what it has
     entries = np.linalg.cholesky(far)
     diagonal = np.log(entries[:, range(modes), range(modes)])

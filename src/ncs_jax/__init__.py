@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ncs_jax.metrics.quality import measure, summarise
     from ncs_jax.network.rollout import animate, stepper
     from ncs_jax.prepare.build import Assembly
+    from ncs_jax.runs.adapt import Adapted, adapt
     from ncs_jax.runs.log import Report
     from ncs_jax.runs.run import Run, assemble, load_run
     from ncs_jax.runs.simulate import Trajectory, simulate
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ncs_jax.scene.step_inputs import frame_inputs
 
 __all__ = [
+    "Adapted",
     "Assembly",
     "Garment",
     "InputError",
@@ -33,6 +35,7 @@ __all__ = [
     "StepInputs",
     "Terms",
     "Trajectory",
+    "adapt",
     "animate",
     "assemble",
     "energy_terms",
@@ -57,6 +60,7 @@ _HOMES = {
     "metrics.quality": ("measure", "summarise"),
     "network.rollout": ("animate", "stepper"),
     "prepare.build": ("Assembly",),
+    "runs.adapt": ("Adapted", "adapt"),
     "runs.log": ("Report",),
     "runs.run": ("Run", "assemble", "load_run"),
     "runs.simulate": ("Trajectory", "simulate"),

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ncs_jax.cli import arguments
+from ncs_jax.cli.train import adapted
 from ncs_jax.errors import InputError
 
 if TYPE_CHECKING:
     from ncs_jax.io import MotionRecord
     from ncs_jax.prepare.build import Assembly
+    from ncs_jax.runs.run import Run
 
 __all__ = ["add_commands", "animate", "export"]
 
@@ -21,8 +23,10 @@ def add_commands(commands) -> None:
     parser = arguments.command(commands, "animate", animate, "animate a trained garment over a motion")
     parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
     parser.add_argument(
-        "--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: the scene's first motion)"
-    )
+        "--motion", metavar="FILE", action="append", default=[],
+        help="motion: FILE, FILE[10:300] or ncs:NAME (default: the scene's first one); given again, one more to --adapt to",
+    )  # fmt: skip
+    arguments.add_adapting(parser)
     parser.add_argument(
         "--alpha",
         type=arguments.finite,
@@ -55,25 +59,18 @@ def animate(options) -> int:
 
     from ncs_jax import io
     from ncs_jax.io.animation.animation import animation_suffix
-    from ncs_jax.runs.run import load_run
 
     suffix = animation_suffix(options.out, with_body=options.body)  # before the run is read
-    run = load_run(options.folder)
-    motions = (options.motion,) if options.motion else run.assembly.scene.motions
-    if not motions:
-        raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
-    worn_by, motion = None, run.motion(motions[0])
-    run = replace(run, assembly=replace(run.assembly, motions={motions[0]: motion}))  # read once
-    if options.motion:
-        _tell_motion(run.assembly, motion)
+    run, motion = _run_and_motion(options)
+    worn_by = None
     if options.body:
         if run.assembly.body is None:
             raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
         worn_by = run.assembly.body, motion
-    vertices, error = run.animate(motions[0], options.alpha), ""
+    vertices, error = run.animate(motion, options.alpha), ""
     if options.rank or options.bfloat16:
-        smaller = run.compressed(motions[0], rank=options.rank or 0, bfloat16=options.bfloat16)
-        whole, vertices = vertices, smaller.animate(motions[0], options.alpha)
+        smaller = run.compressed(motion, rank=options.rank or 0, bfloat16=options.bfloat16)
+        whole, vertices = vertices, smaller.animate(motion, options.alpha)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     garment = run.assembly.garment
@@ -90,15 +87,38 @@ def animate(options) -> int:
     return 0
 
 
-def _tell_motion(assembly: Assembly, motion: MotionRecord) -> None:
-    """Print how the one motion of an assembly drives the body, and what in it puts the animation at risk."""
+def _run_and_motion(options) -> tuple[Run, MotionRecord]:
+    """Return the run to animate, adapted if that is asked for, and the first of its motions, read once."""
+    from ncs_jax.cli.check import tell_beyond
+    from ncs_jax.runs.run import load_run
+
+    if options.adapt is None and (len(options.motion) > 1 or options.adapted):
+        field, value = ("--adapted", options.adapted) if options.adapted else ("--motion", ", ".join(options.motion))
+        raise InputError("one motion expected without --adapt", field=field, value=value, mend="add --adapt 20")
+    run = load_run(options.folder)
+    motions = options.motion or list(run.assembly.scene.motions[:1])
+    if not motions:
+        raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
+    records = {name: run.motion(name) for name in motions}
+    run = replace(run, assembly=replace(run.assembly, motions=records))
+    if options.motion:
+        _tell_motions(run.assembly)
+    if options.adapt is not None:
+        run = adapted(run, motions, options).run
+    tell_beyond(run.coverage(records[motions[0]]))
+    return run, records[motions[0]]
+
+
+def _tell_motions(assembly: Assembly) -> None:
+    """Print how the motions of an assembly drive the body, and what in them puts the animation at risk."""
     from ncs_jax.cli.check import tell, tell_risk
     from ncs_jax.prepare.scene_checks import motion_risks
 
     for risk in motion_risks(assembly):
         tell_risk(risk)
-    for number, note in enumerate(motion.notes):
-        tell("" if number else "motion", note)
+    for motion in assembly.motions.values():
+        for number, note in enumerate(motion.notes):
+            tell("" if number else "motion", note)
 
 
 def export(options) -> int:

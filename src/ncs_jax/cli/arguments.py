@@ -15,6 +15,7 @@ from ncs_jax.errors import InputError
 __all__ = [
     "BLENDER",
     "FORMATS",
+    "add_adapting",
     "add_body",
     "body_of",
     "body_table",
@@ -50,6 +51,15 @@ def add_body(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
     )
+
+
+def add_adapting(parser: argparse.ArgumentParser) -> None:
+    """Add the options with which a run is adapted to the motion first."""
+    parser.add_argument(
+        "--adapt", type=positive, metavar="SECONDS",
+        help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
+    )  # fmt: skip
+    parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
 
 
 def check_file(name: str) -> None:

@@ -15,10 +15,11 @@ from ncs_jax.scene.spec import load_scene, template
 
 if TYPE_CHECKING:
     from ncs_jax.io import MotionRecord
+    from ncs_jax.metrics.coverage import Coverage
     from ncs_jax.prepare.scene_checks import Risk
     from ncs_jax.prepare.setting import Setting
 
-__all__ = ["add_commands", "check", "tell", "tell_risk"]
+__all__ = ["add_commands", "check", "tell", "tell_beyond", "tell_risk"]
 
 DRAWN = 4  # motions in the picture, at most
 NAMED = 6  # motions of a group that are named, at most
@@ -103,6 +104,12 @@ def _words(risk: Risk) -> str:
 def tell_risk(risk: Risk) -> None:
     """Print a risk."""
     tell("at risk", _words(risk))
+
+
+def tell_beyond(found: Coverage | None, name: str = "") -> None:
+    """Print that a motion is beyond what a run was trained on, where it is."""
+    if found is not None and found.told:
+        tell("beyond", f"{name}: {found}" if name else str(found))
 
 
 def tell(label: str, text: str) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from ncs_jax.cli import arguments
+from ncs_jax.cli.check import tell_beyond
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_names import split_frames
 from ncs_jax.scene.spec import Scene, load_scene
@@ -44,13 +46,11 @@ def evaluate(options) -> int:
     """Print how an animation does and how it moves, in physical units."""
     target, scene = Path(options.target), _scene(options)  # before JAX is imported, which takes a second
 
-    import numpy as np
-
-    from ncs_jax.metrics.motion import MEASURES, compare_motion, measure_motion
-    from ncs_jax.metrics.quality import QUANTITIES, measure, summarise
+    from ncs_jax.metrics.motion import compare_motion, measure_motion
+    from ncs_jax.metrics.quality import measure, summarise
     from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 
-    rows, moving = {}, {}
+    rows, moving, beyond = {}, {}, {}
 
     def look(run, name, track, vertices):
         model = run.assembly.model
@@ -63,12 +63,15 @@ def evaluate(options) -> int:
     if scene is None:
         run = load_run(target)
         run.check_terms()
+        run = replace(run, trained=run.known())
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
         if options.reference is not None and len(names) > 1:
             raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")
         for name in names:
             track = run.track(name)
             look(run, name, track, run.animate(track, options.alpha))
+            if (found := run.coverage(track)) is not None:
+                beyond[name], rows[name]["outside"] = found, 100.0 * found.outside
             if options.alpha != 0 and run.assembly.network.controlled:
                 still = measure_motion(run.assembly.model, run.animate(track, 0.0), track)["speed"]
                 moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
@@ -81,9 +84,23 @@ def evaluate(options) -> int:
         look(run, names[0], track, read_animation_over(target, run.assembly.model, track))
     if options.json:
         frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}
-        print(json.dumps({n: {"mean": summarise(r) | moving[n], "frames": frames[n]} for n, r in rows.items()}))
+        told = {n: {"beyond": found.facts()} for n, found in beyond.items()}
+        means = {n: {"mean": summarise(r) | moving[n], "frames": frames[n]} | told.get(n, {}) for n, r in rows.items()}
+        print(json.dumps(means))
         return 0
-    means = {name: summarise(r) | moving[name] for name, r in rows.items()}
+    for name, found in beyond.items():
+        tell_beyond(found, name)
+    _print({name: summarise(r) | moving[name] for name, r in rows.items()})
+    return 0
+
+
+def _print(means: dict[str, dict[str, float]]) -> None:
+    """Print a table of each quantity over the motions."""
+    import numpy as np
+
+    from ncs_jax.metrics.motion import MEASURES
+    from ncs_jax.metrics.quality import QUANTITIES, summarise
+
     if len(means) > 1:
         every = dict.fromkeys(k for m in means.values() for k in m)
         means["all"] = summarise({k: np.array([m[k] for m in means.values() if k in m]) for k in every})
@@ -97,4 +114,3 @@ def evaluate(options) -> int:
         for name, m in zip(labels, means.values(), strict=True):
             if quantity in m:
                 print(f"  {name:{width}} {m[quantity]:.4g}")
-    return 0

@@ -7,8 +7,9 @@ import shlex
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ncs_jax.cli import arguments
 from ncs_jax.cli.preview import draw
@@ -17,7 +18,11 @@ from ncs_jax.errors import InputError
 from ncs_jax.runs.log import Report
 from ncs_jax.scene.spec import PRESETS, load_scene
 
-__all__ = ["add_commands", "demo", "leave", "train"]
+if TYPE_CHECKING:
+    from ncs_jax.runs.adapt import Adapted
+    from ncs_jax.runs.run import Run
+
+__all__ = ["adapted", "add_commands", "demo", "leave", "train"]
 
 DEMO_MINUTES = 3.0
 
@@ -90,6 +95,24 @@ def demo(options) -> int:
     return 0
 
 
+def adapted(run: Run, motions: Sequence[str], options) -> Adapted:
+    """Adapt a run to motions as the options of `arguments.add_adapting` say, with a bar; print what it was and what it is."""
+    from ncs_jax.runs.adapt import adapt, adapted_folder
+
+    folder = options.adapted or adapted_folder(Path(run.assembly.scene.source).parent, motions)
+    with _TrainingBar() as bar:
+        try:
+            found = adapt(run, motions, options.adapt, folder, report=bar.show, say=bar.begin)
+        except KeyboardInterrupt:
+            if bar.reports:
+                bar.say(f"{folder} keeps what is learned so far; the same command goes on from there")
+            raise
+    if not bar.reports:
+        print(f"{folder} has its {found.seconds:g} seconds already: nothing was trained; --adapt, with more, goes on")
+    print("\n".join(f"  {line}" for line in str(found).splitlines()))
+    return found
+
+
 def _trained(scene, out, **chosen):
     """Train with a bar, and say so where a run has all its steps already."""
     import jax
@@ -141,6 +164,10 @@ class _TrainingBar:
         if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
             self._handler = None
+
+    def say(self, line: str) -> None:
+        """Print a line."""
+        self._progress.say(line)
 
     def begin(self, doing: str) -> None:
         """Say what is done before the first step."""

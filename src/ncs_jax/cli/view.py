@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from ncs_jax.cli import arguments
+from ncs_jax.cli.check import tell_beyond
+from ncs_jax.cli.train import adapted
+from ncs_jax.errors import InputError
 
 __all__ = ["add_commands", "view"]
 
@@ -16,6 +19,7 @@ def add_commands(commands) -> None:
     parser.add_argument(
         "--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: all of the scene's, to be chosen)"
     )
+    arguments.add_adapting(parser)
     parser.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
     parser.add_argument(
         "--overlay", metavar="RUN|FILE", nargs="+", default=[], help="others of the first motion, to lay over it"
@@ -28,19 +32,32 @@ def view(options) -> int:
     """Serve the page until it is interrupted."""
     for name in (options.target, *options.overlay):
         arguments.check_file(name)
+    target = options.target if options.adapt is None and not options.adapted else _adapted(options)
     from ncs_jax.view import live
 
     window = live.view(
-        options.target,
+        target,
         scene=options.scene,
         motion=options.motion,
         overlays=options.overlay,
         host=options.host,
         port=options.port,
     )
+    tell_beyond(window.coverage, window.subject.motions[0])
     print(f"{window.address}  (over SSH: ssh -L {options.port}:localhost:{options.port} HOST; Ctrl-C ends it)", flush=True)
     try:
         window.wait()
     except KeyboardInterrupt:
         window.close()
     return 0
+
+
+def _adapted(options) -> str:
+    """Return the folder of the run, adapted to the motion."""
+    if options.adapt is None or not options.motion:
+        field = "--motion" if options.adapt else "--adapted"
+        raise InputError("--motion and --adapt expected together", field=field, mend="add --motion FILE --adapt 20")
+    arguments.check_run(options.target)
+    from ncs_jax.runs.run import load_run
+
+    return str(adapted(load_run(options.target), [options.motion], options).folder)

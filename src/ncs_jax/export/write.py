@@ -39,6 +39,8 @@ class Exported:
         text = f"{self.file}: {self.facts['format']}, {size}; {self.file}.json says how to run it\n  "
         if "usable_until" in self.facts:
             text += f"usable until {self.facts['usable_until']}: {self.facts['usable_until_means']}\n  "
+        if self.facts.get("beyond", {}).get("told"):
+            text += f"{self.facts['beyond']['motion']}: {self.facts['beyond']['means']}\n  "
         if self.check is None:
             return text + "not checked: that takes a motion (--motion FILE) and, of an ONNX file, pip install onnxruntime"
         difference, milliseconds, frames, error = self.check
@@ -56,6 +58,7 @@ def export(
     *,
     motion: MotionRecord | None = None,
     trained: tuple[Method, dict] | None = None,
+    beyond: dict | None = None,
 ) -> Exported:
     """Write a garment's step, and its facts into FILE.json.
 
@@ -64,7 +67,8 @@ def export(
 
     Args:
         format: of the file, else ONNX. motion: to check the file on, its first 240 frames. trained: network and parameters that
-            the error is measured from, where those of the file are smaller or rounded.
+            the error is measured from, where those of the file are smaller or rounded. beyond: what the facts say of where the
+            motion is beyond the trained ones.
 
     Raises:
         InputError: the format's package is missing, the network does what ONNX cannot, or the place is unwritable.
@@ -75,7 +79,7 @@ def export(
     if format.float16:
         params = rounded(params)
     step = flat_step(model, network, params)
-    facts = host_facts(assembly, step, file, format)
+    facts = host_facts(assembly, step, file, format) | ({} if beyond is None else {"beyond": beyond})
     text = json.dumps(facts, indent=2)
     if format.name == "onnx":
         data = onnx_model(step.call, step.arguments, RESULTS, opset=format.opset, facts=text).SerializeToString()

@@ -46,6 +46,7 @@ QUANTITIES = {
     "depth_max": ("mm", "deepest penetration"),
     "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
+    "outside": ("%", "frames beyond the poses and speeds that the network was trained on"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
 }
 

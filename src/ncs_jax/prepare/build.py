@@ -32,7 +32,15 @@ from ncs_jax.scene.spec import Scene
 from ncs_jax.scene.step_inputs import step_inputs
 from ncs_jax.training.shares import Shares, Stretch, shares_of
 
-__all__ = ["Assembly", "TrainingMotions", "build", "features_from_records", "tell_a_person"]
+__all__ = [
+    "Assembly",
+    "TrainingMotions",
+    "build",
+    "features_from_records",
+    "tell_a_person",
+    "training_features",
+    "training_motions",
+]
 
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
@@ -124,8 +132,8 @@ def build(
     automatic, scene = scene.network.cell == "auto", setting.scene
     model, body, track, faces, training = setting.model, setting.body, None, None, None
     if prepared is None:
-        training = _training_motions(setting)
-        track, _ = training.features(model, None if training.shares is None else training.shares.spread())
+        training = training_motions(setting)
+        track = training_features(training, model)
     prepared = setting.prepared
     if model.body is not None and body is not None:
         faces = touchable_faces(model, body, prepared.part)
@@ -158,7 +166,12 @@ def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures)
     jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 
 
-def _training_motions(setting: Setting) -> TrainingMotions:
+def training_features(training: TrainingMotions, model: Model) -> MotionFeatures:
+    """Return what `Assembly.track` gives."""
+    return training.features(model, None if training.shares is None else training.shares.spread())[0]
+
+
+def training_motions(setting: Setting) -> TrainingMotions:
     """Return the training motions, with their mirror images if wanted; one frame at rest where there is none."""
     scene, model, body = setting.scene, setting.model, setting.body
     motions = [setting.motions[name] for name in scene.motion.files]

@@ -23,7 +23,7 @@ from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
 from ncs_jax.scene.spec import NetworkSpec, Scene, scene_from
 from ncs_jax.training.step import initial_state
 
-__all__ = ["assemble_run", "facts_of_run", "resumed_scene"]
+__all__ = ["assemble_run", "facts_of_run", "resumed_scene", "unread_joints"]
 
 FREE = ("damping",)  # fields of [network] that no weight depends on
 
@@ -156,7 +156,7 @@ def _assemble_started(
     _check_shapes(name, run.params, like, scene)
     if (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment):
         assembly = _with_fields_of(before.prepared, assembly)
-    if unread := _unread(assembly):
+    if unread := unread_joints(assembly):
         told = f"the network of {name} does not read joints that turn in the motions: {', '.join(unread)}"
         warnings.warn(f"{told}; what they do to the garment is not learned", category=InputWarning, stacklevel=4)
     return assembly, jax.tree.map(jnp.array, run.params)  # copies: training uses up what it is given
@@ -203,7 +203,7 @@ def _check_shapes(name: str, params: dict, like: dict, scene: Scene) -> None:
             )  # fmt: skip
 
 
-def _unread(assembly: Assembly) -> list[str]:
+def unread_joints(assembly: Assembly) -> list[str]:
     """Return the names of joints that carry the garment, turn in the training motions, and are not read by the network."""
     body, prepared = assembly.body, assembly.prepared
     if body is None:

@@ -3,6 +3,7 @@
     RUN/run.json                the scene, the steps planned, the seed, the versions
     RUN/prepared.npz            what was computed from the scene's files: skinning weights, touchable part, modes
     RUN/prepared-STEP.npz       the same with what training found of the garment at a step: its stiffness by pose
+    RUN/trained.npz             what poses and speeds it was trained on
     RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
     RUN/log.csv                 one row a report
 
@@ -27,10 +28,20 @@ import jax
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.tables.npz import read_npz
+from ncs_jax.io.tables.npz import read_npz, write_npz
+from ncs_jax.metrics.coverage import TrainedMotion
 from ncs_jax.prepare.prepared import Prepared
 
-__all__ = ["Checkpoints", "check_writable", "read_prepared", "read_run", "write_prepared", "write_run"]
+__all__ = [
+    "Checkpoints",
+    "check_writable",
+    "read_prepared",
+    "read_run",
+    "read_trained",
+    "write_prepared",
+    "write_run",
+    "write_trained",
+]
 
 KEPT = 2  # checkpoints
 NAME = "default"  # what Orbax calls the one thing in a checkpoint: so its version 0 did, and each reads what the other wrote
@@ -109,6 +120,24 @@ def read_prepared(run: Path) -> Prepared:
         return Prepared(**{name: table.array(name) for name in names if name in table or name in first})
     except InputError as error:
         raise InputError(error.expected, file=path, field=error.field, mend="train again into a new folder") from None
+
+
+def write_trained(run: Path, trained: TrainedMotion) -> None:
+    """Write RUN/trained.npz atomically."""
+    write_npz(run / "trained.npz", **vars(trained))
+
+
+def read_trained(run: Path) -> TrainedMotion | None:
+    """Read RUN/trained.npz; None in a run of an earlier version, which has none.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path, names = Path(run) / "trained.npz", [f.name for f in dataclasses.fields(TrainedMotion)]
+    if not path.exists():
+        return None
+    table = read_npz(path, names.__contains__)
+    return TrainedMotion(**{name: table.array(name) for name in names})
 
 
 class Checkpoints:

@@ -15,15 +15,16 @@ from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError
 from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
+from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion
 from ncs_jax.metrics.quality import measure
 from ncs_jax.network.compression import compress
 from ncs_jax.network.methods.method import Method, check_network
 from ncs_jax.network.rollout import animated, first_broken
-from ncs_jax.prepare.build import Assembly, build, features_from_records
+from ncs_jax.prepare.build import Assembly, build, features_from_records, training_features, training_motions
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.setting import Below
-from ncs_jax.runs.checkpoint import Checkpoints, read_prepared, read_run
+from ncs_jax.runs.checkpoint import Checkpoints, read_prepared, read_run, read_trained
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model
 from ncs_jax.scene.spec import Scene, scene_from
@@ -43,6 +44,7 @@ class Run:
     params: dict
     steps: int = 0
     lacking: tuple[str, ...] = ()  # names of own terms that it was trained with and that were not given again
+    trained: TrainedMotion | None = None  # what it was trained on, if that is known
 
     def track(self, motion: str | io.MotionRecord | MotionFeatures) -> MotionFeatures:
         """Return a motion, ready to animate: a file, `ncs:NAME`, one as the scene names it, or a record of poses.
@@ -129,6 +131,7 @@ class Run:
             FileFormat(format, float16, opset),
             motion=None if motion is None else self.motion(motion),
             trained=(self.assembly.network, self.params) if rank or float16 else None,
+            beyond=None if motion is None or (found := self.coverage(motion)) is None else {"motion": motion, **found.facts()},
         )
 
     def check_terms(self) -> None:
@@ -141,10 +144,40 @@ class Run:
     def evaluate(
         self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0, *, exact: bool = True
     ) -> dict[str, np.ndarray]:
-        """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`."""
+        """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`.
+
+        Of a run that knows what it was trained on, `outside` says which frames are beyond that, see `coverage`.
+        """
         self.check_terms()
         track = self.track(motion)
-        return measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
+        rows = measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
+        found = None if self.trained is None else self.coverage(track)
+        return rows if found is None else rows | {"outside": 100.0 * found.outside}
+
+    def coverage(self, motion: str | io.MotionRecord | MotionFeatures) -> Coverage | None:
+        """Return how far each frame of a motion is from the poses and speeds that the run was trained on.
+
+            found = run.coverage("dance.bvh")
+            found.share, found.worst   # of the frames that are beyond; frame, joint, and whether by its pose or its speed
+
+        None where nobody knows: of a run of an earlier version whose motions cannot be read any more.
+        """
+        a, trained = self.assembly, self.known()
+        if trained is None:
+            return None
+        names = a.body.joint_names if a.body is not None else ()
+        return coverage(trained, a.model, self.track(motion), names=names, moving=a.network.state > 0)
+
+    def known(self) -> TrainedMotion | None:
+        """Return what the run was trained on, found again from the motions of its scene where it was not kept."""
+        a = self.assembly
+        if self.trained is not None or not a.scene.motion.files:
+            return self.trained
+        try:
+            motions = {name: self.motion(name) for name in a.scene.motion.files}
+        except InputError:
+            return None
+        return trained_motion(a.model, training_features(training_motions(replace(a, motions=motions)), a.model))
 
 
 def load_run(folder: str | Path, *, terms: Sequence[OwnTerm] = (), network: NetworkMaker | None = None) -> Run:
@@ -170,7 +203,7 @@ def load_run(folder: str | Path, *, terms: Sequence[OwnTerm] = (), network: Netw
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
     lacking = () if terms else tuple(facts.get("terms", ()))
-    return Run(assembly, checkpoints.restore(like).params, step, lacking)
+    return Run(assembly, checkpoints.restore(like).params, step, lacking, read_trained(folder))
 
 
 def own_names(terms: Sequence[OwnTerm], network: NetworkMaker | None) -> dict:

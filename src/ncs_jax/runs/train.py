@@ -10,18 +10,21 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
+from ncs_jax.metrics.coverage import TrainedMotion, trained_motion
 from ncs_jax.metrics.quality import summarise
 from ncs_jax.prepare.build import Assembly
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
-from ncs_jax.runs.checkpoint import Checkpoints, write_prepared, write_run
+from ncs_jax.runs.checkpoint import Checkpoints, read_trained, write_prepared, write_run, write_trained
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
 from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within
@@ -32,7 +35,7 @@ from ncs_jax.training.devices import trim_memory
 from ncs_jax.training.programs import Programs
 from ncs_jax.training.step import TrainState
 
-__all__ = ["train"]
+__all__ = ["Begun", "train", "train_assembly"]
 
 
 IDLE = 0.5  # mm that alpha should make a difference of, at least
@@ -84,20 +87,56 @@ def train(
     if say is not None:
         say("compiling")
     begin(assembly)
-    placed = PlacedScene(assembly, assembly.scene.training.seed if seed is None else seed, programs)
+    seed = assembly.scene.training.seed if seed is None else seed
+    said = own_names(terms, network) | ({"start": str(start)} if start else {})
+    begun = Begun(facts, said, params, seed, began)
+    return train_assembly(assembly, out, begun, (steps, minutes), report=report, programs=programs)
+
+
+class Begun(NamedTuple):
+    """Where a training begins: what run.json says of the run that is resumed, None of a new one; what else it is to say.
+
+    `params`: weights of another run, if it begins with some. `since`: when it was called for, s.
+    """
+
+    facts: dict | None
+    said: dict
+    params: dict | None
+    seed: int
+    since: float
+
+
+def train_assembly(
+    assembly: Assembly,
+    out: Path | None,
+    begun: Begun,
+    length: tuple[int | None, float | None],
+    *,
+    programs: Programs,
+    report: Callable[[Report], None] | None = None,
+    settle: Callable[[dict], dict] | None = None,
+) -> Run:
+    """Train a scene that was made ready, see `train`.
+
+    Args:
+        length: steps, minutes, or neither. programs: begun for it. settle: gives the weights to keep for the last ones.
+    """
+    placed, facts = PlacedScene(assembly, begun.seed, programs), begun.facts
     if jax.process_index() > 0:  # placing the scene waited for every process: from here on, one may write
         out = report = None
-    state = placed.initial_state(params)
+    state = placed.initial_state(begun.params)
     placed.refresh(state.params, 0)
+    steps, minutes = length
     if facts is None:  # before anything is written: whether it fits into memory
-        placed.compile(state, first)
-        facts = {"steps": 0, **own_names(terms, network)} | ({"start": str(start)} if start else {})
+        placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or assembly.scene.training.steps))
+        facts = {"steps": 0, **begun.said}
     with closing(_Output(placed, out, report, facts)) as output:
-        if params is not None:
+        if begun.params is not None and begun.facts is None:
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
         last = _planned(placed, output, state, steps, minutes)
-        return _Loop(placed, output, placed.copied(state), last, began).run()
+        trained = output.keep_motion()
+        return _Loop(placed, output, placed.copied(state), last, begun.since, settle).run(trained)
 
 
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
@@ -116,12 +155,12 @@ def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int
         validate = functools.partial(_validate, Run(assembly, state.params)) if assembly.scene.motion.validation else None
         costs = measure_costs(placed, state, validate, output.seconds_of_a_checkpoint(state))
         last = int(placed.copied(steps_within(60 * minutes, costs, int(state.step))))
-        if last < ENOUGH and jax.process_index() == 0:
+        if last < ENOUGH and not output.started and jax.process_index() == 0:
             needed = math.ceil(costs.seconds(int(state.step), ENOUGH) / 60)
             upto = f", up to step {last}" if state.step else ""
             what = f"{minutes:g} minutes hold about {last - int(state.step)} steps on this machine{upto}: too few to learn from"
             more = " more" if state.step else ""
-            warnings.warn(f"{what}; {ENOUGH} steps in all take about {needed} minutes{more}", InputWarning, stacklevel=3)
+            warnings.warn(f"{what}; {ENOUGH} steps in all take about {needed} minutes{more}", InputWarning, stacklevel=4)
     if last != output.planned:
         output.plan(last)
     return last
@@ -147,6 +186,20 @@ class _Output:
             scene = self._placed.assembly.scene.to_dict()
             facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
             write_run(self._out, facts)
+
+    def keep_motion(self) -> TrainedMotion:
+        """Return what the run is trained on, and write it down if that was not done."""
+        if self._out is not None and (there := read_trained(self._out)) is not None:
+            return there
+        trained = trained_motion(self._placed.assembly.model, self._placed.assembly.track)
+        if self._out is not None:
+            write_trained(self._out, trained)
+        return trained
+
+    @property
+    def started(self) -> bool:
+        """Return whether the run began with the weights of another one."""
+        return bool(self._facts.get("start"))
 
     @property
     def planned(self) -> int:
@@ -200,8 +253,9 @@ class _Output:
 class _Loop:
     """The steps of a run, chunk by chunk, with what it carries from one chunk to the next."""
 
-    def __init__(self, placed: PlacedScene, output: _Output, state: TrainState, steps: int, began: float):
-        """`state`: on the devices; it is used up. `began`: when training was called, s."""
+    def __init__(self, placed: PlacedScene, output: _Output, state: TrainState, steps: int, began: float, settle=None):
+        """`state`: on the devices; it is used up. `began`: when training was called, s. settle: see `train_assembly`."""
+        self._settle = settle
         spec = placed.assembly.scene.training
         self._placed, self._output, self._state, self._steps, self._began = placed, output, state, steps, began
         self._every, self._check = whole_chunks(spec.checkpoint_every), whole_chunks(spec.validate_every)
@@ -210,8 +264,8 @@ class _Loop:
         self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
         self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
 
-    def run(self) -> Run:
-        """Take every step that is left, and return the trained garment."""
+    def run(self, trained: TrainedMotion) -> Run:
+        """Take every step that is left, and return the garment, trained on motions of which this is kept."""
         placed = self._placed
         placed.refresh(placed.local(self._state.params), self._first)
         if self._first:
@@ -219,16 +273,16 @@ class _Loop:
         self._output.begin_log(self._first)
         for at, count in chunks(self._first, self._steps):
             self._take(at, count)
-        return Run(placed.assembly, placed.local(self._state.params), self._steps)
+        return Run(placed.assembly, placed.local(self._state.params), self._steps, trained=trained)
 
     def _take(self, at: int, count: int) -> None:
         """Take the steps at to at + count, report them, and keep a checkpoint where one is due."""
         placed, done = self._placed, at + count
         self._state, logs = placed.run_chunk(self._state, at, count, self._steps)
         here, logs = placed.local((self._state, logs))
-        if done in (whole_chunks(self._steps // 2), self._steps) and placed.learn_pose_stiffness(
-            here.params, done, self._steps
-        ):
+        # A run that is adapted to a motion keeps the stiffness of all motions.
+        due = self._settle is None and done in (whole_chunks(self._steps // 2), self._steps)
+        if due and placed.learn_pose_stiffness(here.params, done, self._steps):
             self._output.keep(done, placed.assembly)
         if self._timed is None:  # this chunk was compiled
             trim_memory()
@@ -239,6 +293,9 @@ class _Loop:
             self._output.save(done, here)
             raise
         whole = done % self._every == 0
+        if self._settle is not None and done == self._steps:
+            here = replace(here, params=self._settle(here.params))
+            self._state = placed.copied(here)
         if whole or done == self._steps:
             self._output.save(done, here)
         if whole:  # where a run that is resumed begins

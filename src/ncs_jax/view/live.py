@@ -228,6 +228,7 @@ class View:
             run, name = self.subject.run, self.motion.value
             self.track = run.track(name)
             self.vertices = self.subject.animate(name, float(self.alpha.value))
+            self.coverage = run.coverage(self.track) if run.params else None
             posed = self._posed_body(name)
             self.body = posed.vertices if posed is not None else np.zeros((len(self.vertices), 0, 3), np.float32)
             self.fps = run.assembly.model.fps
@@ -262,7 +263,7 @@ class View:
         if name == "cloth":
             for part in self.bins:
                 part.visible = False
-            return f"frame {frame} of {len(self.vertices)}, {frame / self.fps:.2f} s"
+            return f"frame {frame} of {len(self.vertices)}, {frame / self.fps:.2f} s{self._beyond(frame)}"
         values = vertex_values(name, self.subject.run, self.vertices, self.track, frame, other)
         unit, most = COLOURS[name]
         chosen = colour_bins(values, self.faces, most)
@@ -276,6 +277,14 @@ class View:
             f"frame {frame}, {frame / self.fps:.2f} s: {name}, mean {values.mean():.3g}, at most {values.max():.3g} {unit}; "
             f"the scale ends at {most:g} {unit}"
         )
+
+    def _beyond(self, frame: int) -> str:
+        """Return a caption's words where the frame is beyond what the run was trained on."""
+        found = self.coverage
+        if found is None or not found.outside[frame]:
+            return ""
+        joint = found.joints[int(np.argmax(np.maximum(found.poses[frame], found.speeds[frame])))]
+        return f": beyond what it was trained on, by {joint}"
 
     def wait(self, seconds: float | None = None) -> None:
         """Play until interrupted, or for some seconds."""

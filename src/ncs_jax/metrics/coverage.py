@@ -1,0 +1,198 @@
+"""How far a motion is from the motions that a garment was trained on, joint by joint, in poses and in speeds.
+
+A network is at the energy of a simulation where it was trained. Beyond, its energy rises with the distance of the pose: see
+`FAR`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ncs_jax.scene.features import MotionFeatures
+from ncs_jax.scene.model import Model
+
+__all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "trained_motion"]
+
+FAR = 0.2  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
+FAST = 2.0  # times the largest trained rate, and twice as much of the accelerations, are the limit
+GROWTH = 1.4  # power of the distance with which the energy rises beyond
+TOLD = 0.1  # of the energy, above which a motion is told to be beyond
+CARRIED = 0.005  # of the garment, that a joint and those below it carry at least, if it counts
+KEPT = 1024  # poses of a joint, at most
+CLOSE = 0.03  # distance within which every trained pose of a joint has a kept one, if there are no more than `KEPT`
+SEEN = 8192  # frames that are looked at, at most
+STILL = 0.1, 0.5  # 1/s, m/s^2: least limits of rates and accelerations
+BLOCK = 512
+
+
+@dataclass(frozen=True)
+class TrainedMotion:
+    """What a run keeps of the motions that it was trained on.
+
+    Attributes:
+        poses: (kept, 9) of each joint, those that are farthest from each other: the first two columns of its rotation since its
+            parent, zeros for the root of a network that is free of its heading, and the direction of gravity that it sees.
+        joint: (kept,) of which joint each is, of those that carry the garment.
+        radius: (joints,) how far 19 of 20 trained poses are from the nearest kept one, at most.
+        rates: (joints,) the largest rate of such a pose, 1/s. accelerations: (joints,) of each joint, m/s^2.
+    """
+
+    poses: Float[np.ndarray, "kept 9"]
+    joint: np.ndarray
+    radius: Float[np.ndarray, "joints"]
+    rates: Float[np.ndarray, "joints"]
+    accelerations: Float[np.ndarray, "joints"]
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How far each frame of a motion is from what a run was trained on.
+
+    Attributes:
+        poses, speeds: (frames, joints) distance of each joint's pose and speed as a share of the limit: 1 is at the limit.
+        joints: their names.
+    """
+
+    poses: Float[np.ndarray, "frames joints"]
+    speeds: Float[np.ndarray, "frames joints"]
+    joints: tuple[str, ...]
+
+    @property
+    def distance(self) -> Float[np.ndarray, "frames"]:
+        """Return how far each frame is, by the joint that is farthest: 1 is at the limit."""
+        return np.maximum(self.poses, self.speeds).max(axis=1)
+
+    @property
+    def outside(self) -> np.ndarray:
+        """Return which frames (frames,) are beyond the limit."""
+        return self.distance > 1
+
+    @property
+    def share(self) -> float:
+        """Return the share of frames that are beyond the limit, 0 to 1."""
+        return float(np.mean(self.outside))
+
+    @property
+    def excess(self) -> float:
+        """Return how much more energy is to be expected than adapting to the motion reaches, as a share of it."""
+        return float(np.mean(TOLD * self.distance**GROWTH))
+
+    @property
+    def told(self) -> bool:
+        """Return whether the motion as a whole is beyond what was trained."""
+        return self.excess > TOLD
+
+    @property
+    def worst(self) -> tuple[int, str, str]:
+        """Return the frame that is farthest, the joint that is, and whether by its pose or its speed."""
+        frame = int(np.argmax(self.distance))
+        joint = int(np.argmax(np.maximum(self.poses[frame], self.speeds[frame])))
+        return frame, self.joints[joint], "pose" if self.poses[frame, joint] >= self.speeds[frame, joint] else "speed"
+
+    def facts(self) -> dict:
+        """Return all of it as JSON has it."""
+        frame, joint, what = self.worst
+        worst = {"frame": frame, "joint": joint, "by": what}
+        return {"outside": round(self.share, 4), "worst": worst, "told": self.told, "means": str(self)}
+
+    def __str__(self) -> str:
+        """Return the share of frames, the worst of them, and what helps, in a sentence."""
+        if not self.outside.any():
+            return "every frame is near the poses and speeds that the run was trained on"
+        frame, joint, what = self.worst
+        text = f"{self.share:.0%} of the frames are beyond the poses and speeds that the run was trained on"
+        text += f", frame {frame} most, by the {what} of {joint}"
+        return f"{text}; adapt it with --adapt 20, or train on such motion" if self.told else text
+
+
+def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
+    """Return what a run keeps of the motions in a track: 1,024 poses of each joint at most, and the largest speeds."""
+    poses, rates, accelerations = _described(model, track)
+    joints = range(poses.shape[1])
+    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), SEEN)).astype(int))
+    spread = [_spread(poses[some, j]) for j in joints]
+    kept = np.concatenate([poses[some[chosen], j] for j, (chosen, _) in zip(joints, spread, strict=True)])
+    joint = np.repeat(np.array(joints, np.int16), [len(chosen) for chosen, _ in spread])
+    radius = np.array([np.percentile(far, 95) for _, far in spread])
+    return TrainedMotion(kept.astype(np.float16), joint, radius, rates.max(axis=0), accelerations.max(axis=0))
+
+
+def coverage(
+    trained: TrainedMotion, model: Model, track: MotionFeatures, *, names: Sequence[str] = (), moving: bool = True
+) -> Coverage:
+    """Return how far the frames of a track are from what a run was trained on.
+
+    For each joint it is the distance |d_t - d_k| to the nearest kept pose, less how far trained ones are, over `FAR`, and its
+    rate and acceleration over the largest trained ones, times `FAST` and twice that.
+
+    Args:
+        names: of the body's joints; their numbers where there are none. moving: whether the network reads speeds at all.
+    """
+    poses, rates, accelerations = _described(model, track)
+    far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1)
+    far = np.maximum(far - trained.radius, 0) / FAR
+    fast = rates / np.maximum(FAST * trained.rates, STILL[0])
+    fast = np.maximum(fast, accelerations / np.maximum(2 * FAST * trained.accelerations, STILL[1]))
+    numbers = [model.source_joints[j] for j in _carrying(model)]
+    return Coverage(far, fast if moving else np.zeros_like(far), tuple(names[n] if names else str(n) for n in numbers))
+
+
+def _carrying(model: Model) -> np.ndarray:
+    """Return the numbers of the joints that carry the garment, alone or with the joints below them; the root always does."""
+    carried = np.zeros(len(model.skeleton.parents))
+    np.add.at(carried, list(model.blend.joints), np.asarray(model.blend.weights, np.float64).mean(axis=0))
+    for joint in reversed(range(len(carried))):
+        if (parent := model.skeleton.parents[joint]) >= 0:
+            carried[parent] += carried[joint]
+    return np.flatnonzero(carried >= CARRIED)
+
+
+def _described(model: Model, track: MotionFeatures) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pose of each joint (frames, joints, 9), its rate and the joint's acceleration (frames, joints).
+
+    They are the descriptors (8) and (9) of `scene.descriptors` in physical units, whichever a network reads.
+    """
+    joints, skeleton = _carrying(model), model.skeleton
+    parents = np.asarray(skeleton.parents)[joints]
+    matrices = np.asarray(track.matrices, np.float64)[:, : len(skeleton.parents)]
+    world = matrices[..., :3][:, joints]
+    local = np.einsum("tjba,tjbc->tjac", matrices[..., :3][:, np.maximum(parents, 0)], world)
+    local[:, parents < 0] = world[:, parents < 0]
+    columns = local[..., :2].reshape(*local.shape[:2], 6)
+    gravity = np.asarray(model.material.gravity, np.float64)
+    down = np.einsum("tjba,b->tja", world, gravity / max(float(np.linalg.norm(gravity)), 1e-9))
+    places = np.einsum("tjab,jb->tja", world, np.asarray(skeleton.joints, np.float64)[joints]) + matrices[..., 3][:, joints]
+    poses = np.concatenate([columns, down], axis=-1)
+    now, start = np.arange(len(poses)), np.asarray(track.start)
+    one, two = np.maximum(now - 1, start), np.maximum(now - 2, start)
+    rates = model.fps * np.linalg.norm(poses - poses[one], axis=-1)
+    accelerations = model.fps**2 * np.linalg.norm(places - 2 * places[one] + places[two], axis=-1)
+    if model.descriptor == "heading_free":
+        poses[:, parents < 0, :6] = 0
+    return poses, rates, accelerations
+
+
+def _spread(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of poses (frames, 9) that are far from each other, and how far each pose is from the nearest of them.
+
+    Each in turn is the one that is farthest from those before.
+    """
+    columns = np.ascontiguousarray(poses.T, np.float32)
+    chosen, far = [0], np.full(len(poses), np.inf, np.float32)
+    while True:
+        away = columns - columns[:, chosen[-1], None]
+        np.minimum(far, np.einsum("it,it->t", away, away), out=far)
+        if far.max() <= CLOSE**2 or len(chosen) == KEPT:
+            return np.array(chosen), np.sqrt(far)
+        chosen.append(int(far.argmax()))
+
+
+def _nearest(poses: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return the distance of each pose (frames, 9) to the nearest kept one."""
+    kept = kept.astype(np.float64)
+    parts = np.split(poses, range(BLOCK, len(poses), BLOCK))
+    return np.concatenate([np.linalg.norm(part[:, None] - kept, axis=-1).min(axis=1) for part in parts])

@@ -1,0 +1,105 @@
+"""What a run knows of the motions that it was trained on: near ones are quiet, far ones are told with frame and joint."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_jax import io
+from ncs_jax.errors import InputError
+from ncs_jax.metrics.coverage import FAR, KEPT, TOLD, _nearest, coverage, trained_motion
+from ncs_jax.prepare.build import features_from_records
+from ncs_jax.runs.checkpoint import read_trained, write_trained
+from ncs_jax.runs.run import Run
+
+from .ready import assembled
+from .scenes import swing
+
+
+@pytest.fixture(autouse=True)
+def _plain(plain_jax):
+    yield
+
+
+def record(**options):
+    arrays = swing(frames=60, **options)
+    return io.MotionRecord(arrays["poses"], arrays["trans"], 30.0, ())
+
+
+def seen(trained, assembly, motion, **options):
+    return coverage(trained, assembly.model, features_from_records(assembly.model, motion), **options)
+
+
+@pytest.fixture
+def known():
+    assembly = assembled()
+    return assembly, trained_motion(assembly.model, features_from_records(assembly.model, record()))
+
+
+def test_what_was_trained_on_is_inside_and_so_is_another_heading(known):
+    assembly, trained = known
+    found = seen(trained, assembly, record())
+    assert found.share == 0 and not found.told and found.distance.max() <= 0.5 and found.joints == ("0", "1")
+    assert "every frame is near" in str(found)
+    turned = record()
+    turned.poses[:, 0, 1] += 2.0
+    assert np.allclose(seen(trained, assembly, turned).poses, found.poses, atol=1e-4)
+
+
+def test_a_pose_beyond_is_told_with_its_frame_and_joint(known):
+    assembly, trained = known
+    far = record(size=1.3)
+    found = seen(trained, assembly, far)
+    worst = int(np.abs(far.poses[:, 1, 0]).argmax())
+    assert found.worst[1:] == ("1", "pose") and np.isclose(far.poses[found.worst[0], 1, 0], far.poses[worst, 1, 0])
+    # Beyond 0.5 rad at rest and 1.3 rad there: two columns turn and gravity does, each by a chord of that angle.
+    chord = np.sqrt(2) * 2 * np.sin(0.4)
+    assert np.isclose(found.poses.max() * FAR, chord, rtol=0.05)
+    assert found.told and found.excess > TOLD and np.array_equal(found.outside, found.distance > 1)
+    assert f"{found.share:.0%} of the frames" in str(found) and "joint" not in str(found) and "--adapt 20" in str(found)
+    facts = found.facts()
+    assert facts["worst"] == {"frame": found.worst[0], "joint": "1", "by": "pose"} and facts["told"] is True
+
+
+def test_speeds_beyond_count_where_a_network_reads_them(known):
+    assembly, trained = known
+    motion = record()
+    fast = replace(motion, poses=motion.poses[:31:5], translation=motion.translation[:31:5])
+    found = seen(trained, assembly, fast)
+    assert found.poses.max() < 1 < found.speeds.max() and found.worst[2] == "speed"
+    assert seen(trained, assembly, fast, moving=False).share == 0
+    slower = replace(motion, poses=motion.poses[:31:2][:12], translation=motion.translation[:31:2][:12])
+    assert seen(trained, assembly, slower).distance.max() <= 1
+
+
+def test_few_poses_are_kept_and_every_trained_one_is_near_one(known, rng):
+    assembly, _ = known
+    motion = record()
+    many = replace(motion, poses=rng.normal(size=(2000, 2, 3)).astype(np.float32), translation=np.zeros((2000, 3), np.float32))
+    track = features_from_records(assembly.model, many)
+    trained = trained_motion(assembly.model, track)
+    assert np.bincount(trained.joint).tolist()[1] == KEPT and sum(a.nbytes for a in vars(trained).values()) < 50_000
+    found = coverage(trained, assembly.model, track)
+    assert np.mean(found.poses > 0.02) < 0.06 and trained.radius[1] > FAR > trained.radius[0]  # gravity lies on a sphere
+
+
+def test_the_nearest_pose_is_that_of_a_plain_search(rng):
+    poses, kept = rng.normal(size=(1100, 9)), rng.normal(size=(40, 9))
+    plain = [min(np.linalg.norm(p - k) for k in kept) for p in poses]
+    assert np.allclose(_nearest(poses, kept), plain)
+
+
+def test_it_is_kept_and_found_again_where_it_was_not(known, tmp_path):
+    assembly, trained = known
+    assert read_trained(tmp_path) is None
+    write_trained(tmp_path, trained)
+    back = read_trained(tmp_path)
+    assert all(np.array_equal(a, b) for a, b in zip(vars(back).values(), vars(trained).values(), strict=True))
+    (tmp_path / "trained.npz").write_bytes((tmp_path / "trained.npz").read_bytes()[:200])
+    with pytest.raises(InputError, match=r"trained\.npz"):
+        read_trained(tmp_path)
+    run = Run(assembly, {})  # the motions of the scene are there in memory
+    found, made = run.known(), trained_motion(assembly.model, assembly.track)
+    assert all(np.array_equal(a, b) for a, b in zip(vars(found).values(), vars(made).values(), strict=True))
+    gone = Run(replace(assembly, motions={}), {})
+    assert gone.known() is None and gone.coverage(record()) is None
