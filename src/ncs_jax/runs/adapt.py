@@ -210,7 +210,8 @@ def _scene_on(run: Run, motions: str | Sequence[str]) -> tuple[Scene, dict[str, 
     given, scene = [motions] if isinstance(motions, str) else list(motions), run.assembly.scene
     if not given:
         raise InputError("a motion is needed", field="motion", mend="give one")
-    records, own = {}, {}
+    records: dict[str, MotionRecord] = {}
+    own: dict[str, dict] = {}
     for name in given:
         file = split_frames(name)[0]
         path = scene.path(file) if name in scene.motions else Path(file).expanduser()
