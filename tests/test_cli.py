@@ -629,6 +629,8 @@ def test_export_says_what_it_wrote_and_how_far_it_is(run_folder, tmp_path, capsy
     text = capsys.readouterr().out
     assert f"{out}: onnx, opset 17" in text and f"{out}.json says how" in text
     assert "24 frames" in text and "ms each; at most" in text and "mm from the whole network" in text
+    beyond = json.loads(Path(f"{out}.json").read_text())["beyond"]
+    assert beyond["motion"].endswith("swing.npz") and beyond["outside"] == 0 and not beyond["told"]
     assert main(["export", str(folder), "--out", str(tmp_path / "step"), "--format", "stablehlo"]) == 0
     text = capsys.readouterr().out
     assert "stablehlo" in text and "whole" not in text and (tmp_path / "step.json").exists()
