@@ -575,6 +575,7 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     assert main(["evaluate", str(tmp_path / "a.npz"), "--scene", str(scene), "--json"]) == 0
     (again,) = json.loads(capsys.readouterr().out).values()
     assert whole["mean"].pop("gain") > 0  # over what alpha = 0 gives, which a file does not tell
+    assert whole["mean"].pop("outside") == 0 == whole["beyond"]["outside"]  # of what the run was trained on
     for name, value in whole["mean"].items():
         assert again["mean"][name] == pytest.approx(value, rel=2e-3, abs=1e-3), name
     assert main(["evaluate", str(folder)]) == 0
@@ -590,8 +591,10 @@ def test_evaluate_of_all_motions_tells_the_deepest_of_them(run_folder, tmp_path,
     motions = (*load_run(folder).assembly.scene.motion.files, str(tmp_path / "nods.npz"))
     monkeypatch.setattr("ncs_jax.scene.spec.Scene.motions", motions)
     assert main(["evaluate", str(folder)]) == 0
+    said = capsys.readouterr()
+    assert "nods.npz: " in said.err and "beyond the poses and speeds that the run was trained on" in said.err
     told, quantity = {}, ""
-    for line in capsys.readouterr().out.splitlines():
+    for line in said.out.splitlines():
         if line.startswith("  "):
             told[quantity].append(float(line.split()[-1]))
         else:
@@ -645,6 +648,8 @@ def test_export_says_what_it_wrote_and_how_far_it_is(run_folder, tmp_path, capsy
     text = capsys.readouterr().out
     assert f"{out}: onnx, opset 17" in text and f"{out}.json says how" in text
     assert "24 frames" in text and "ms each; at most" in text and "mm from the whole network" in text
+    beyond = json.loads(Path(f"{out}.json").read_text())["beyond"]
+    assert beyond["motion"].endswith("swing.npz") and beyond["outside"] == 0 and not beyond["told"]
     assert main(["export", str(folder), "--out", str(tmp_path / "step"), "--format", "stablehlo"]) == 0
     text = capsys.readouterr().out
     assert "stablehlo" in text and "whole" not in text and (tmp_path / "step.json").exists()

@@ -106,10 +106,10 @@ def tell_risk(risk: Risk) -> None:
     tell("at risk", _words(risk))
 
 
-def tell_beyond(found: Coverage | None, name: str = "") -> None:
+def tell_beyond(found: Coverage | None) -> None:
     """Print that a motion is beyond what a run was trained on, where it is."""
     if found is not None and found.told:
-        tell("beyond", f"{name}: {found}" if name else str(found))
+        tell("beyond", str(found))
 
 
 def tell(label: str, text: str) -> None:

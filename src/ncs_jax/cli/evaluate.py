@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 from ncs_jax.cli import arguments
-from ncs_jax.cli.check import tell_beyond
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.scene.motion_names import split_frames
 from ncs_jax.scene.spec import Scene, load_scene
 
@@ -72,6 +72,8 @@ def evaluate(options) -> int:
             look(run, name, track, run.animate(track, options.alpha))
             if (found := run.coverage(track)) is not None:
                 beyond[name], rows[name]["outside"] = found, 100.0 * found.outside
+                if found.told:
+                    warnings.warn(f"{name}: {found}", InputWarning, stacklevel=1)
             if options.alpha != 0 and run.assembly.network.controlled:
                 still = measure_motion(run.assembly.model, run.animate(track, 0.0), track)["speed"]
                 moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
@@ -88,8 +90,6 @@ def evaluate(options) -> int:
         means = {n: {"mean": summarise(r) | moving[n], "frames": frames[n]} | told.get(n, {}) for n, r in rows.items()}
         print(json.dumps(means))
         return 0
-    for name, found in beyond.items():
-        tell_beyond(found, name)
     _print({name: summarise(r) | moving[name] for name, r in rows.items()})
     return 0
 

@@ -43,7 +43,7 @@ def view(options) -> int:
         host=options.host,
         port=options.port,
     )
-    tell_beyond(window.coverage, window.subject.motions[0])
+    tell_beyond(window.coverage)
     print(f"{window.address}  (over SSH: ssh -L {options.port}:localhost:{options.port} HOST; Ctrl-C ends it)", flush=True)
     try:
         window.wait()

@@ -152,6 +152,7 @@ class View:
         run = subject.run
         # Another alpha leaves the body as it is.
         self._posed_body = functools.lru_cache(1)(lambda name: posed_body(run.assembly, run.motion(name)))
+        self._coverage_of = functools.lru_cache(1)(lambda name: run.coverage(name) if run.params else None)
         self._add_meshes()
         self._add_controls()
         self._load()
@@ -228,7 +229,7 @@ class View:
             run, name = self.subject.run, self.motion.value
             self.track = run.track(name)
             self.vertices = self.subject.animate(name, float(self.alpha.value))
-            self.coverage = run.coverage(self.track) if run.params else None
+            self.coverage = self._coverage_of(name)
             posed = self._posed_body(name)
             self.body = posed.vertices if posed is not None else np.zeros((len(self.vertices), 0, 3), np.float32)
             self.fps = run.assembly.model.fps
