@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import ncs_jax
 
 ASSETS = Path(ncs_jax.__file__).parent / "assets"
-GARMENTS = {"tshirt": (900, 1200), "tshirt_fine": (4000, 5000), "skirt": (900, 1200), "skirt_fine": (4000, 5000)}
+SIZES = {"": (900, 1200), "_fine": (4000, 5000)}
+GARMENTS = {name + fine: size for name in ("tshirt", "skirt", "dress") for fine, size in SIZES.items()}
 MOTIONS = ("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance", "mixed")
 HOLDS = {"walk_turn_stop": 4.0, "jump": 1.0, "twist": 1.5}  # seconds of rest at the end
 # Largest turn of a joint from the rest pose, degrees. The A-pose is 42 degrees from hanging arms, its elbows bent by 40.
@@ -198,8 +199,9 @@ def test_garment_mesh_is_clean(name):
     assert (np.unique(faces) == np.arange(len(vertices))).all()
     edges, count = edge_counts(faces)
     assert count.max() == 2
-    assert boundary_loops(faces) == (4 if "shirt" in name else 2)
-    assert len(vertices) - len(edges) + len(faces) == (-2 if "shirt" in name else 0)
+    openings = 2 if "skirt" in name else 4
+    assert boundary_loops(faces) == openings
+    assert len(vertices) - len(edges) + len(faces) == 2 - openings
     angles = smallest_angles(vertices, faces)
     assert angles.min() > 15 and (angles > 20).mean() > 0.998 and np.median(angles) > 45
     lengths = np.linalg.norm(np.diff(vertices[edges].astype(float), axis=1)[:, 0], axis=1)
@@ -213,7 +215,8 @@ def test_garment_clears_the_body(name):
     skin, cloth = body["vertices"].astype(float), garment["vertices"].astype(float)
     distance, _ = signed_distance(cloth, skin, body["faces"])
     assert distance.min() >= 0.003
-    near = skin[cKDTree(cloth).query(skin)[0] < 0.05]
+    bare = part("Arm", "ForeArm", "Hand", "FingerBase", "HandFinger1") if "dress" in name else np.zeros(len(skin), bool)
+    near = skin[(cKDTree(cloth).query(skin)[0] < 0.05) & ~bare]
     depth, offset = signed_distance(near, cloth, garment["faces"])
     # Beyond a hem the nearest cloth is a boundary edge and has no inside: look only at skin straight under a face.
     normal_like = np.abs(depth) < 0.03
@@ -223,8 +226,9 @@ def test_garment_clears_the_body(name):
 
 def _at_hem(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     edges, count = edge_counts(faces)
-    rim = np.unique(edges[count == 1])
-    return cKDTree(vertices[rim]).query(points)[0] < 0.02
+    a, b = vertices[edges[count == 1]].swapaxes(0, 1)
+    rim = np.concatenate([a + share * (b - a) for share in np.linspace(0, 1, 5)])
+    return cKDTree(rim).query(points)[0] < 0.02
 
 
 @pytest.mark.parametrize("name", ["skirt", "skirt_fine"])
@@ -234,6 +238,24 @@ def test_skirt_is_pinned_at_the_waistband(name):
     assert len(pins) >= 24
     assert (height[pins] > height.max() - 0.0201).all()
     assert (np.delete(height, pins) <= height.max() - 0.0199).all()
+
+
+@pytest.mark.parametrize("name", ["dress", "dress_fine"])
+def test_dress_hangs_from_shoulders_and_waist_and_is_wide_at_the_hem(name):
+    dress, body = load(name), load("body")
+    vertices, weights = dress["vertices"].astype(float), dress["blend_weights"]
+    edges, count = edge_counts(dress["faces"])
+    rim = vertices[edges[count == 1]]
+    low = rim[:, :, 1].max(1) < vertices[:, 1].min() + 0.01
+    hem, middle = np.linalg.norm(rim[low, 0] - rim[low, 1], axis=1).sum(), (vertices[:, 1] - 1.035)
+    waist = cKDTree(body["vertices"]).query(vertices[np.abs(middle) < 0.03])[0]
+    assert np.median(waist) < 0.03
+    length = (1.035 - vertices[:, 1].min()) / 0.8  # along the cloth, which is a cone whose radius grows by 0.6 of it
+    assert 1.035 - length == pytest.approx(0.28, abs=0.03)  # on the calf
+    assert (hem - 0.69) / length > 1.1 * np.pi  # as it opens from a waist of 0.69 m: half a circle would be pi
+    assert np.abs(weights.sum(1) - 1).max() == 0 and weights.min() >= 0
+    hips = weights[:, list(body["joint_names"]).index("Hips")]
+    assert (hips[vertices[:, 1] < 0.83] > 0.99).all() and (hips[vertices[:, 1] > 1.04] < 0.1).all()
 
 
 @pytest.mark.parametrize("name", MOTIONS)
