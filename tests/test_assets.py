@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,11 +12,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import ncs_jax
+from ncs_jax.io import read_body
+from ncs_jax.io.packaged import packaged
+from ncs_jax.prepare.setting import load_motion
+from ncs_jax.scene.spec import MotionSpec, Scene
+from ncs_jax.view.character import body_vertices
+from tools.make_recordings import CUTS, make_recording
 
 ASSETS = Path(ncs_jax.__file__).parent / "assets"
 SIZES = {"": (900, 1200), "_fine": (4000, 5000)}
 GARMENTS = {name + fine: size for name in ("tshirt", "skirt", "dress") for fine, size in SIZES.items()}
 MOTIONS = ("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance", "mixed")
+RECORDINGS = tuple(f"cmu_{name}" for name in ("walk", "walk_fast", "run", "dance", "spin", "turn", "ball", "stand"))
+CMU = Path(__file__).parents[2] / "shared" / "data" / "cmu_mocap_bvh"
 HOLDS = {"walk_turn_stop": 4.0, "jump": 1.0, "twist": 1.5}  # seconds of rest at the end
 # Largest turn of a joint from the rest pose, degrees. The A-pose is 42 degrees from hanging arms, its elbows bent by 40.
 LIMITS = {
@@ -335,6 +344,37 @@ def test_motion_starts_with_hanging_arms_and_is_smooth(name):
     acceleration = np.linalg.norm(np.diff(place, 2, axis=0), axis=2) * 30**2
     assert acceleration.max() < 130  # m/s^2; the legs straightening at take-off
     assert acceleration[0].max() < 3
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_recording_moves_the_body_without_leaps(name):
+    motion, (vertices, place) = load(name), pose(name)
+    assert motion["poses"].shape == (len(place), 31, 3) and float(motion["fps"]) == 30
+    assert list(motion["joint_names"]) == list(load("body")["joint_names"])
+    assert np.abs(motion["trans"][0, [0, 2]]).max() == 0
+    turns = Rotation.from_rotvec(motion["poses"][:-1].reshape(-1, 3)).inv() * Rotation.from_rotvec(
+        motion["poses"][1:].reshape(-1, 3)
+    )
+    assert np.degrees(turns.magnitude().max()) < 90  # in a frame, from which on `ncs check` tells of a risk
+    assert np.linalg.norm(np.diff(place, axis=0), axis=2).max() < 0.3  # m
+    lowest = vertices[..., 1].min(1)
+    assert np.percentile(lowest, 5) > -0.08 and np.median(lowest) < 0.05
+
+
+@pytest.mark.skipif(not CMU.exists(), reason="needs recordings that are not in the repository")
+@pytest.mark.parametrize("name", ["cmu_run", "cmu_turn"])
+def test_a_recording_is_what_its_script_makes_of_the_file(name):
+    clip, *cut = CUTS[name]
+    body = read_body(packaged("body"))
+    made, kept = make_recording(body, CMU / f"{clip}.bvh", cut), load(name)
+    np.testing.assert_allclose(kept["poses"], made["poses"], atol=2e-4)
+    np.testing.assert_allclose(kept["trans"], made["trans"], atol=5e-5)
+    file = f"{CMU / clip}.bvh[{cut[0]}:{cut[1]}]"
+    exact = load_motion(Scene(motion=MotionSpec(files=(file,), rest="zero")), file, body)
+    path = exact.translation - exact.translation[0] * (1, 0, 1)
+    right = body_vertices(body, replace(exact, translation=path))
+    away = np.linalg.norm(right - pose(name)[0], axis=2).max(0)
+    assert away[~part("Foot", "ToeBase") & ~part("Leg")].max() < 1e-4  # m; a foot may have been set straight
 
 
 @pytest.mark.parametrize(("name", "seconds"), HOLDS.items())
