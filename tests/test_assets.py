@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,10 +12,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import ncs_jax
+from ncs_jax.io import read_body
+from ncs_jax.io.packaged import packaged
+from ncs_jax.prepare.setting import load_motion
+from ncs_jax.scene.spec import MotionSpec, Scene
+from ncs_jax.view.character import body_vertices
+from tools.make_recordings import CUTS, make_recording
 
 ASSETS = Path(ncs_jax.__file__).parent / "assets"
-GARMENTS = {"tshirt": (900, 1200), "tshirt_fine": (4000, 5000), "skirt": (900, 1200), "skirt_fine": (4000, 5000)}
+SIZES = {"": (900, 1200), "_fine": (4000, 5000)}
+GARMENTS = {name + fine: size for name in ("tshirt", "skirt", "dress") for fine, size in SIZES.items()}
 MOTIONS = ("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance", "mixed")
+RECORDINGS = tuple(f"cmu_{name}" for name in ("walk", "walk_fast", "run", "dance", "spin", "turn", "ball", "stand"))
+CMU = Path(__file__).parents[2] / "shared" / "data" / "cmu_mocap_bvh"
 HOLDS = {"walk_turn_stop": 4.0, "jump": 1.0, "twist": 1.5}  # seconds of rest at the end
 # Largest turn of a joint from the rest pose, degrees. The A-pose is 42 degrees from hanging arms, its elbows bent by 40.
 LIMITS = {
@@ -198,8 +208,9 @@ def test_garment_mesh_is_clean(name):
     assert (np.unique(faces) == np.arange(len(vertices))).all()
     edges, count = edge_counts(faces)
     assert count.max() == 2
-    assert boundary_loops(faces) == (4 if "shirt" in name else 2)
-    assert len(vertices) - len(edges) + len(faces) == (-2 if "shirt" in name else 0)
+    openings = 2 if "skirt" in name else 4
+    assert boundary_loops(faces) == openings
+    assert len(vertices) - len(edges) + len(faces) == 2 - openings
     angles = smallest_angles(vertices, faces)
     assert angles.min() > 15 and (angles > 20).mean() > 0.998 and np.median(angles) > 45
     lengths = np.linalg.norm(np.diff(vertices[edges].astype(float), axis=1)[:, 0], axis=1)
@@ -213,7 +224,8 @@ def test_garment_clears_the_body(name):
     skin, cloth = body["vertices"].astype(float), garment["vertices"].astype(float)
     distance, _ = signed_distance(cloth, skin, body["faces"])
     assert distance.min() >= 0.003
-    near = skin[cKDTree(cloth).query(skin)[0] < 0.05]
+    bare = part("Arm", "ForeArm", "Hand", "FingerBase", "HandFinger1") if "dress" in name else np.zeros(len(skin), bool)
+    near = skin[(cKDTree(cloth).query(skin)[0] < 0.05) & ~bare]
     depth, offset = signed_distance(near, cloth, garment["faces"])
     # Beyond a hem the nearest cloth is a boundary edge and has no inside: look only at skin straight under a face.
     normal_like = np.abs(depth) < 0.03
@@ -223,8 +235,9 @@ def test_garment_clears_the_body(name):
 
 def _at_hem(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     edges, count = edge_counts(faces)
-    rim = np.unique(edges[count == 1])
-    return cKDTree(vertices[rim]).query(points)[0] < 0.02
+    a, b = vertices[edges[count == 1]].swapaxes(0, 1)
+    rim = np.concatenate([a + share * (b - a) for share in np.linspace(0, 1, 5)])
+    return cKDTree(rim).query(points)[0] < 0.02
 
 
 @pytest.mark.parametrize("name", ["skirt", "skirt_fine"])
@@ -234,6 +247,24 @@ def test_skirt_is_pinned_at_the_waistband(name):
     assert len(pins) >= 24
     assert (height[pins] > height.max() - 0.0201).all()
     assert (np.delete(height, pins) <= height.max() - 0.0199).all()
+
+
+@pytest.mark.parametrize("name", ["dress", "dress_fine"])
+def test_dress_hangs_from_shoulders_and_waist_and_is_wide_at_the_hem(name):
+    dress, body = load(name), load("body")
+    vertices, weights = dress["vertices"].astype(float), dress["blend_weights"]
+    edges, count = edge_counts(dress["faces"])
+    rim = vertices[edges[count == 1]]
+    low = rim[:, :, 1].max(1) < vertices[:, 1].min() + 0.01
+    hem, middle = np.linalg.norm(rim[low, 0] - rim[low, 1], axis=1).sum(), (vertices[:, 1] - 1.035)
+    waist = cKDTree(body["vertices"]).query(vertices[np.abs(middle) < 0.03])[0]
+    assert np.median(waist) < 0.03
+    length = (1.035 - vertices[:, 1].min()) / 0.8  # along the cloth, which is a cone whose radius grows by 0.6 of it
+    assert 1.035 - length == pytest.approx(0.28, abs=0.03)  # on the calf
+    assert (hem - 0.69) / length > 1.1 * np.pi  # as it opens from a waist of 0.69 m: half a circle would be pi
+    assert np.abs(weights.sum(1) - 1).max() == 0 and weights.min() >= 0
+    hips = weights[:, list(body["joint_names"]).index("Hips")]
+    assert (hips[vertices[:, 1] < 0.83] > 0.99).all() and (hips[vertices[:, 1] > 1.04] < 0.1).all()
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -313,6 +344,37 @@ def test_motion_starts_with_hanging_arms_and_is_smooth(name):
     acceleration = np.linalg.norm(np.diff(place, 2, axis=0), axis=2) * 30**2
     assert acceleration.max() < 130  # m/s^2; the legs straightening at take-off
     assert acceleration[0].max() < 3
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_recording_moves_the_body_without_leaps(name):
+    motion, (vertices, place) = load(name), pose(name)
+    assert motion["poses"].shape == (len(place), 31, 3) and float(motion["fps"]) == 30
+    assert list(motion["joint_names"]) == list(load("body")["joint_names"])
+    assert np.abs(motion["trans"][0, [0, 2]]).max() == 0
+    turns = Rotation.from_rotvec(motion["poses"][:-1].reshape(-1, 3)).inv() * Rotation.from_rotvec(
+        motion["poses"][1:].reshape(-1, 3)
+    )
+    assert np.degrees(turns.magnitude().max()) < 90  # in a frame, from which on `ncs check` tells of a risk
+    assert np.linalg.norm(np.diff(place, axis=0), axis=2).max() < 0.3  # m
+    lowest = vertices[..., 1].min(1)
+    assert np.percentile(lowest, 5) > -0.08 and np.median(lowest) < 0.05
+
+
+@pytest.mark.skipif(not CMU.exists(), reason="needs recordings that are not in the repository")
+@pytest.mark.parametrize("name", ["cmu_run", "cmu_turn"])
+def test_a_recording_is_what_its_script_makes_of_the_file(name):
+    clip, *cut = CUTS[name]
+    body = read_body(packaged("body"))
+    made, kept = make_recording(body, CMU / f"{clip}.bvh", cut), load(name)
+    np.testing.assert_allclose(kept["poses"], made["poses"], atol=2e-4)
+    np.testing.assert_allclose(kept["trans"], made["trans"], atol=5e-5)
+    file = f"{CMU / clip}.bvh[{cut[0]}:{cut[1]}]"
+    exact = load_motion(Scene(motion=MotionSpec(files=(file,), rest="zero")), file, body)
+    path = exact.translation - exact.translation[0] * (1, 0, 1)
+    right = body_vertices(body, replace(exact, translation=path))
+    away = np.linalg.norm(right - pose(name)[0], axis=2).max(0)
+    assert away[~part("Foot", "ToeBase") & ~part("Leg")].max() < 1e-4  # m; a foot may have been set straight
 
 
 @pytest.mark.parametrize(("name", "seconds"), HOLDS.items())

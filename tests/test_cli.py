@@ -455,7 +455,7 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     assert main(["preview", str(folder), "--motion", str(tmp_path / "other.npz"), "--out", str(out)]) == 0
     text = capsys.readouterr().out
     written = [Path(line.strip()).name for line in text.splitlines() if line.startswith(f"  {out}")]
-    assert written == ["preview.png", "preview.html", "preview.gif", "energies.png"]
+    assert written == ["preview.png", "preview.html", "alphas.png", "preview.gif", "energies.png"]
     assert re.search(
         r"other.npz, which it never trained on, one frame in 3:\n  mean strain [0-9.]+ %, penetrating vertices", text
     )

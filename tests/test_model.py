@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.geometry.mesh import topology
@@ -23,13 +24,16 @@ from ncs_jax.geometry.skinning import (
     to_rest_axes,
     transforms,
 )
+from ncs_jax.geometry.winding_number import winding_number
+from ncs_jax.io import read_body, read_garment
+from ncs_jax.io.packaged import packaged
 from ncs_jax.io.records import BodyRecord
 from ncs_jax.prepare.posing import corrected_rest
 from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import touchable
+from ncs_jax.prepare.touchable import enclosure, touchable, touchable_part
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
-from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.spec import GarmentSpec, Scene, load_scene
 
 from .scenes import post, write_scene
 from .shapes import ball, rotation, sheet
@@ -187,6 +191,30 @@ def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
         assert (by_pose[1] & ~by_pose[0] & ~by_pose[2]).any()  # the folded arm is what the poses are looked at for
     at_rest = touchable(record, cloth, blend, np.zeros((0, 2, 3)), reach)
     np.testing.assert_array_equal(at_rest, by_pose[0])
+
+
+def test_enclosure_is_the_winding_number_away_from_the_cloth(rng):
+    """A wide open cone: from far above it to within its opening and below."""
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0.05, 0.8, 20), indexing="ij")
+    cone = np.stack([height * np.cos(angle), -height, height * np.sin(angle)], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(48), np.arange(19), indexing="ij")
+    a, b, c, d = (20 * ((i + p) % 48) + j + q for p, q in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (b, d, c))])
+    x = rng.uniform(-1, 1, (400, 3))
+    x = x[cKDTree(cone).query(x)[0] > 0.15]
+    right = np.abs(winding_number(x, cone[faces]))
+    assert right.max() > 0.7 and right.min() < 0.02  # from within to outside
+    np.testing.assert_allclose(enclosure(x, cone, faces), right, atol=0.01)
+
+
+def test_a_wide_skirt_touches_the_legs_that_it_stands_off():
+    """No leg is within reach of the packaged dress at rest, which stands off as a cone."""
+    body, dress = read_body(packaged("body")), read_garment(packaged("dress"))
+    scene = Scene(garment=GarmentSpec("ncs:dress"))
+    found = touchable_part(scene, body, dress, dress.weights, [])
+    near = touchable(body, dress.vertices, blend_from(dress.weights), np.zeros((0, 31, 3)), scene.physics.collision.reach)
+    shins = np.flatnonzero((body.vertices[:, 1] > 0.2) & (body.vertices[:, 1] < 0.4))
+    assert np.isin(shins, found).all() and not near[shins].any()
 
 
 def test_the_host_corrects_a_pose_as_the_model_does(rng):

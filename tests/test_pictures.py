@@ -21,7 +21,7 @@ from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.prepare.posing import skinned
 from ncs_jax.scene.spec import scene_from
-from ncs_jax.view import curves, pictures
+from ncs_jax.view import curves, pictures, preview
 from ncs_jax.view.animation import Animation, PosedBody, upright, upright_axes
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.character import body_vertices, posed_body
@@ -199,6 +199,25 @@ def test_contact_sheet(tmp_path, swing):
     filled = cloth[: cloth.shape[0] // 2].any(0)
     assert (np.diff(filled.astype(int)) == 1).sum() == 3
     assert (np.diff(cloth.any(1).astype(int)) == 1).sum() == 2
+
+
+def test_moments_may_be_chosen(tmp_path, swing):
+    for name, frames in (("even", 2), ("chosen", [0, len(swing.garment) - 1]), ("other", [0, 1])):
+        pictures.contact_sheet(tmp_path / f"{name}.png", swing, frames=frames, tile=60, labels=("one", "two"))
+    even, chosen, other = (np.asarray(Image.open(tmp_path / f"{name}.png")) for name in ("even", "chosen", "other"))
+    assert (even == chosen).all() and (even.shape != other.shape or (even != other).any())
+    with pytest.raises(InputError, match="moments from 0"):
+        pictures.contact_sheet(tmp_path / "a.png", swing, frames=[0, len(swing.garment)])
+
+
+def test_alphas_are_shown_where_they_are_farthest_apart(swing):
+    away = np.where(np.isin(np.arange(16), (0, 5, 9, 14)), 1.0, 0.1)
+    far = replace(swing, garment=np.zeros((16, *swing.garment.shape[1:])) + away[:, None, None], body=None)
+    near = replace(far, garment=0 * far.garment)
+    apart = preview._apart({"0": near, "1": near, "1.5": far})
+    np.testing.assert_allclose(apart, np.sqrt(3) * away, rtol=1e-6)
+    assert {0, 5, 9, 14} < set(moments := preview._moments(apart)) and len(moments) == 8 and moments == sorted(set(moments))
+    assert preview._moments(apart[:3]) == [0, 1, 2]
 
 
 def test_animations_are_drawn_below_each_other(tmp_path, swing):

@@ -59,7 +59,7 @@ def test_relative_paths_resolve_from_the_file(tmp_path):
     assert scene.to_dict()["garment"]["file"] == str(tmp_path / "shirt.obj")
 
 
-@pytest.mark.parametrize("name", ["demo", "tshirt", "skirt"])
+@pytest.mark.parametrize("name", ["demo", "tshirt", "skirt", "dress"])
 def test_packaged_scenes_are_good(name):
     assert load_scene(f"ncs:{name}").path("ncs:body").is_file()
 

@@ -33,7 +33,7 @@ def found(folder, text=SOUND, motion=None, cloth=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ncs:tshirt", "ncs:skirt"])
+@pytest.mark.parametrize("name", ["ncs:tshirt", "ncs:skirt", "ncs:dress"])
 def test_the_packaged_scenes_are_safe(name, plain_jax, capsys, tmp_path):
     assert main(["check", name, "--out", str(tmp_path / "check.png")]) == 0
     assert "safe" in capsys.readouterr().out

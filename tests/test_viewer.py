@@ -278,6 +278,10 @@ def test_a_browser_draws_it(tmp_path, scene):
     assert columns["1"] < columns["0"] - 20  # half a metre to the left, under a camera that stays
     assert np.abs(seen["0"] - seen["1"]).max(2).mean() > 1
     assert np.abs(seen["0"][5, 320] - (247, 245, 241)).max() <= 1
+    both = screenshot(tmp_path, page, "frame=6&azimuth=0&paused&alpha=all")
+    halves = [cloth_coloured(both)[:, half] for half in (slice(320), slice(320, 640))]
+    across = [np.nonzero(half)[1].mean() for half in halves]
+    assert min(half.sum() for half in halves) > 400 and across[1] < across[0] - 5  # alpha 0, then 1, each under its own camera
     bare = screenshot(tmp_path, page, "frame=6&azimuth=0&paused&alpha=0&body=0")
     assert cloth_coloured(bare).sum() > 1500 and np.abs(bare - seen["0"]).max() > 60
     verts = scene["body"].shape[1]

@@ -1,4 +1,4 @@
-"""The packaged T-shirt and skirt, each at two resolutions, made to measure for the packaged body.
+"""The packaged T-shirt, skirt and dress, each at two resolutions, made to measure for the packaged body.
 
 A garment starts as a signed distance field around the body: body distance, made to hang (a slice may not be much
 narrower than the slice above it), rounded where arm meets trunk, minus the ease. Its zero surface is cut at the
@@ -16,27 +16,43 @@ from remeshing import clip, mirror, remesh, vertex_normals
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
+from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
+from ncs_jax.io import BodyRecord, GarmentRecord
+from ncs_jax.prepare.fit import spread_weights
+
 CELL = 0.008  # m
 CLEARANCE = 0.004  # m, kept by the script; the tests ask for 3 mm
 UNDER_FACES = 0.0015  # m, body vertices stay at least this far under the garment's faces
 WAISTBAND = 0.02  # m
+TRUNK = (-0.05, 0.30), (0.98, 1.48), (-0.25, 0.30)  # m, x, y and z: where a dress lies close
+ARM = tuple(
+    n for n in ORDER if n.removeprefix("Left").removeprefix("Right") in ("Arm", "ForeArm", "Hand", "FingerBase", "HandFinger1")
+)
+WAIST = 1.035  # m, the dress' narrowest place
+CIRCLE = 0.6  # of a whole circle of cloth: the dress' skirt laid flat
 
 Field = Callable[[np.ndarray], np.ndarray]
 
 
 def make_garments(body: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """All garments by file name."""
-    shirt, shirt_edges = _shirt(body), {"tshirt": 0.0260, "tshirt_fine": 0.01225}
-    skirt, skirt_edges = _skirt(body), {"skirt": 0.0278, "skirt_fine": 0.0130}
+    cuts = {
+        _shirt: {"tshirt": 0.0260, "tshirt_fine": 0.01225},
+        _skirt: {"skirt": 0.0278, "skirt_fine": 0.0130},
+        _dress: {"dress": 0.0455, "dress_fine": 0.0220},
+    }
     out = {}
-    for (surface, project), edges in ((shirt, shirt_edges), (skirt, skirt_edges)):
+    for cut, edges in cuts.items():
+        surface, project = cut(body)
         for name, edge in edges.items():
             vertices, faces = _cut_mesh(surface, edge, project)
-            vertices = _clear(vertices, faces, body)
+            vertices = _clear(vertices, faces, body, ARM if cut is _dress else ())
             out[name] = {"vertices": vertices, "faces": faces}
             if name.startswith("skirt"):
                 top = vertices[:, 1].max()
                 out[name]["group_pins"] = np.flatnonzero(vertices[:, 1] > top - WAISTBAND).astype(np.int32)
+            if cut is _dress:
+                out[name]["blend_weights"] = _hung_weights(vertices, faces, body)
     return out
 
 
@@ -137,6 +153,48 @@ def _skirt(body: dict[str, np.ndarray]) -> tuple:
     field = gaussian_filter(field - ease, 1.2)
     wanted = {"middle": points[..., 0], "waist": waist - points[..., 1], "hem": points[..., 1] - knee}
     return _surface(low, field, wanted)
+
+
+def _dress(body: dict[str, np.ndarray]) -> tuple:
+    """A sleeveless bodice, close to the body down to the waist, and a skirt to the calf, `CIRCLE` of a circle of cloth."""
+    (across, height, _), neck = _joint(body, "LeftArm"), _joint(body, "Neck")
+    waist, calf, bust = WAIST, 0.28, _joint(body, "Spine1")[1] + 0.06
+    length, slope = waist - calf, CIRCLE / np.sqrt(1 - CIRCLE**2)  # along the cloth; out for each metre down
+    hem = waist - length * np.sqrt(1 - CIRCLE**2)
+    low, points = _grid([-0.05, hem - 0.04, -0.66], [0.70, 1.48, 0.72])
+    near = tuple(slice(*np.round((np.array(ends) - low[i]) / CELL).astype(int)) for i, ends in enumerate(TRUNK))
+    trunk = np.ones(points.shape[:3])  # m, far from it but where the bodice is
+    trunk[near] = _body_fields(body, points[near], ARM)[1]
+    below = _ramp(-points[..., 1], -bust - 0.04, -bust + 0.10)
+    trunk = trunk * (1 - below) + _closing(trunk, 0.07) * below
+    trunk = _hang(trunk, -0.35, int((bust - low[1]) / CELL))
+    ease = 0.008 + 0.006 * _ramp(-points[..., 1], 0.02 - height, 0.15 - height)
+    bodice, down = trunk - ease, waist - points[..., 1]
+    level = bodice[:, round((waist - low[1]) / CELL)]
+    outside, inside = distance_transform_edt(level > 0), distance_transform_edt(level <= 0)
+    out = CELL * (outside - inside)[:, None]  # of the waistline, in the plane
+    flare = np.where(down > 0, (out - slope * down) * np.sqrt(1 - CIRCLE**2), np.maximum(out, -down))
+    field = gaussian_filter(_smooth_min(bodice, flare, 0.01), 1.2)
+
+    front = _ramp(points[..., 2], neck[2] - 0.05, neck[2] + 0.06)
+    collar = neck[1] + 0.012 - points[..., 1] - 0.075 * front + 1.2 * np.maximum(np.abs(points[..., 0]) - 0.060, 0)
+    armhole = -_smooth_min(points[..., 0] - across + 0.018, points[..., 1] - height + 0.105, 0.06)
+    wanted = {"middle": points[..., 0], "hem": points[..., 1] - hem, "armhole": armhole, "neck": collar}
+    return _surface(low, field, wanted)
+
+
+def _hung_weights(vertices: np.ndarray, faces: np.ndarray, body: dict[str, np.ndarray]) -> np.ndarray:
+    """Weights (V, J) of a bodice that follows the body and of a skirt that follows the hips, and no leg or hand."""
+    dense = np.zeros((len(body["vertices"]), len(body["joints"])), np.float32)
+    np.add.at(dense, (np.arange(len(dense))[:, None], body["weight_joints"]), body["weights"])
+    wearer = BodyRecord(body["vertices"], body["faces"], body["joints"], body["parents"], dense)
+    away = distance_and_direction(vertices, wearer.vertices, wearer.faces, border_of(wearer.faces, len(wearer.vertices)))
+    weights, _ = spread_weights(GarmentRecord(vertices, faces), wearer, *away)
+    hung = _ramp(WAIST - vertices[:, 1:2], 0.0, 0.2)
+    weights = weights * (1 - hung) + hung * (np.arange(len(ORDER)) == ORDER.index("Hips"))
+    weights = np.round(weights * 256)
+    weights[np.arange(len(weights)), weights.argmax(1)] += 256 - weights.sum(1)
+    return (weights / 256).astype(np.float32)
 
 
 def _surface(low: np.ndarray, field: np.ndarray, wanted: dict[str, np.ndarray]) -> tuple:
@@ -263,10 +321,11 @@ def _cut_mesh(surface: tuple, edge: float, project: Callable) -> tuple[np.ndarra
     return vertices, faces
 
 
-def _clear(vertices: np.ndarray, faces: np.ndarray, body: dict[str, np.ndarray]) -> np.ndarray:
-    """Push vertices out of the body, and faces off body vertices, evenly left and right; then round."""
+def _clear(vertices: np.ndarray, faces: np.ndarray, body: dict[str, np.ndarray], bare: tuple[str, ...]) -> np.ndarray:
+    """Push vertices out of the body, and faces off body vertices but those of bare joints, left as right; then round."""
     skin, skin_faces = body["vertices"].astype(float), body["faces"]
-    near = skin[cKDTree(vertices).query(skin)[0] < 0.06]
+    shows = np.isin(body["weight_joints"][:, 0], [ORDER.index(name) for name in bare])
+    near = skin[(cKDTree(vertices).query(skin)[0] < 0.06) & ~shows]
     for _ in range(60):
         distance, _, normal = signed_distance(vertices, skin, skin_faces)
         short = np.maximum(CLEARANCE + 2e-4 - distance, 0)

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands", "fit"]
 
-MOTIONS = ("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance")
+MOTIONS = (
+    *("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance"),
+    *(f"cmu_{name}" for name in ("walk", "walk_fast", "run", "dance", "spin", "turn", "ball", "stand")),
+)
 LIMBS = {"left arm", "right arm", "left thigh", "right thigh"}  # whose joints the packaged motions must find
 
 

@@ -20,8 +20,8 @@ __all__ = ["main"]
 DESCRIPTION = """\
 Neural cloth simulation: a garment learns to move on an animated character from physics alone.
 
-  ncs demo                          train the packaged T-shirt and write a preview to look at
-  ncs train SCENE --out RUN         train the garment of a scene file (ncs:demo, ncs:tshirt and ncs:skirt are packaged)
+  ncs demo                          train the packaged dress and write a preview to look at
+  ncs train SCENE --out RUN         train the garment of a scene file (packaged: ncs:demo, ncs:tshirt, ncs:skirt, ncs:dress)
   ncs preview RUN                   draw it again: a picture, a page that plays it, a GIF
   ncs animate RUN --out FILE        animate a trained garment
   ncs export RUN --out FILE         write its step for a game engine or another host, as ONNX or StableHLO

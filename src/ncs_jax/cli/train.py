@@ -29,7 +29,7 @@ DEMO_MINUTES = 3.0
 
 def add_commands(commands) -> None:
     """Declare the options."""
-    parser = arguments.command(commands, "demo", demo, "train the packaged T-shirt and write pictures and a page that plays it")
+    parser = arguments.command(commands, "demo", demo, "train the packaged dress and write pictures and a page that plays it")
     parser.add_argument("--out", default="runs/demo", help="run folder (default: runs/demo)")
     parser.add_argument("--minutes", type=arguments.positive, help="minutes of training, from the first step on (default: 3)")
     parser.add_argument("--scene", default="ncs:demo", help="another scene file")
@@ -85,7 +85,7 @@ def train(options) -> int:
 
 
 def demo(options) -> int:
-    """Train the packaged T-shirt, draw it and print how it does on a motion that it never saw; a demo that is there goes on."""
+    """Train the packaged dress, draw it and print how it does on a motion that it never saw; a demo that is there goes on."""
     out = Path(options.out)
     resume = (out / "run.json").exists()
     minutes = options.minutes if options.minutes or resume else DEMO_MINUTES

@@ -137,11 +137,21 @@ def _font(size):
     return ImageFont.load_default(size)
 
 
+def _moments(frames: int | Sequence[int], count: int) -> list[int]:
+    """Return some moments of `count`, evenly spread, or those that are named."""
+    if isinstance(frames, int):
+        return np.unique(np.linspace(0, count - 1, max(1, frames)).round().astype(int)).tolist()
+    chosen = [int(frame) for frame in frames]
+    if not chosen or min(chosen) < 0 or max(chosen) >= count:
+        raise InputError(f"moments from 0 to {count - 1} expected", field="frames", value=chosen)
+    return chosen
+
+
 def contact_sheet(
     path: str | Path,
     animation: Animation | Mapping[str, Animation],
     *,
-    frames: int = 8,
+    frames: int | Sequence[int] = 8,
     tile: int = 520,
     labels: Sequence[str] = (),
 ) -> None:
@@ -151,11 +161,11 @@ def contact_sheet(
 
     Args:
         path: of the PNG. animation: to draw; or several by their names, each in a row, from the front. frames: how many
-            moments, evenly spread. tile: height of one picture in pixels. labels: of the moments; without them the time of
-            each.
+            moments, evenly spread; or which. tile: height of one picture in pixels. labels: of the moments; without them the
+            time of each.
 
     Raises:
-        InputError: animations have other frames, or there is not a label for each moment.
+        InputError: animations have other frames, or not these moments, or there is not a label for each of them.
     """
     if isinstance(animation, Animation):
         stage = _stage(animation)
@@ -165,7 +175,7 @@ def contact_sheet(
     counts = {stage.frames for *_, stage in rows}
     if len(counts) != 1:
         raise InputError("animations of as many frames expected", field="animation", value=sorted(counts))
-    chosen = np.unique(np.linspace(0, counts.pop() - 1, max(1, frames)).round().astype(int)).tolist()
+    chosen = _moments(frames, counts.pop())
     if labels and len(labels) != len(chosen):
         raise InputError(f"a label for each of {len(chosen)} moments expected", field="labels", value=len(labels))
     turned = [[stage.heading(frame) + VIEWS[view] for frame in chosen] for _, view, stage in rows]

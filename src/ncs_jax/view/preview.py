@@ -22,6 +22,7 @@ __all__ = ["PreviewStep", "preview"]
 
 ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
+MOMENTS = 8  # in the picture of the alphas
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
 BARE = 1.0  # mm outside the cloth, from which skin is said to show
 NAMED = 8  # motions that a run trained on which the page names
@@ -46,12 +47,13 @@ def preview(
     log: str | Path | None = None,
     report: Callable[[PreviewStep], None] | None = None,
 ) -> dict[str, float]:
-    """Write preview.png, preview.html, preview.gif and energies.png into a folder; return how the motion comes out at alpha 1.
+    """Write preview.png, .html, .gif, alphas.png and energies.png into a folder; return how the motion comes out at alpha 1.
 
-    The picture and the page come first, the measures last, and the page is then written again with them. Strain and penetration
-    are exact, of every n-th frame, so that there are no more than `MEASURED`: `ncs evaluate` measures all, and the energies.
-    Keys: strain_mean (%), with a body penetrating (%), depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n;
-    measured, frames. Where skin is 1 mm outside: bare, in how many; barest, the worst. Curves need a log and matplotlib.
+    The alphas are in rows, at moments at which they differ most. The picture and the page come first, the measures last, and
+    the page is then written again with them. Strain and penetration are exact, of every n-th frame, so that there are no more
+    than `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body penetrating (%),
+    depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n; measured, frames. Where skin is 1 mm outside: bare, in
+    how many; barest, the worst. Curves need a log and matplotlib.
 
     Args:
         run: trained.
@@ -72,21 +74,17 @@ def preview(
     tell, title = report or (lambda step: None), title or "Neural cloth simulation"
     tell(PreviewStep(None, "drawing the picture", 0.0))
     track, controlled = run.track(names[0]), run.assembly.network.controlled
-    shown = 1.0 if controlled else 0.0
-    animation = animation_of(run.assembly, run.motion(names[0]), run.animate(track, shown))
+    animation = animation_of(run.assembly, run.motion(names[0]), run.animate(track, float(controlled)))
     pictures.contact_sheet(sheet := folder / "preview.png", animation, tile=TILE)
 
     tell(PreviewStep(sheet, "writing the page", 0.2))
-    by_alpha = {
-        f"{alpha:g}": animation if alpha == shown else replace(animation, garment=run.animate(track, alpha))
-        for alpha in (ALPHAS if controlled else (0.0,))
-    }
-    facts = {"motion": names[0], "trained": f"{run.steps} steps on {_some(scene.motion.files)}"}
+    others = {alpha: replace(animation, garment=run.animate(track, alpha)) for alpha in ALPHAS if controlled and alpha != 1}
+    by_alpha = {f"{alpha:g}": others.get(alpha, animation) for alpha in (ALPHAS if controlled else (0.0,))}
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
-    write(facts=facts)
-
-    tell(PreviewStep(played, "drawing the GIF", 0.3))
-    drawing = lambda share: tell(PreviewStep(None, "drawing the GIF", 0.3 + 0.5 * share))  # noqa: E731
+    write(facts=(facts := _facts_of_the_run(run, names[0], by_alpha)))
+    tell(PreviewStep(played, "drawing the alphas", 0.3))
+    tell(PreviewStep(_draw_alphas(folder, by_alpha) if controlled else None, "drawing the GIF", 0.35))
+    drawing = lambda share: tell(PreviewStep(None, "drawing the GIF", 0.35 + 0.45 * share))  # noqa: E731
     few = animation.every(max(1, round(animation.fps / FPS)))
     pictures.animation_gif(gif := folder / "preview.gif", few, max_frames=FRAMES, size=SIZE, report=drawing)
 
@@ -103,6 +101,33 @@ def _some(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
+
+
+def _facts_of_the_run(run: Run, motion: str, by_alpha: dict[str, Animation]) -> dict[str, str]:
+    """Return what the page says of the run, the motion, and what alpha does to it."""
+    far = {"alpha 0 and 1.5": f"up to {1000 * _apart(by_alpha).max():.0f} mm apart, the mean of the garment"}
+    trained = f"{run.steps} steps on {_some(run.assembly.scene.motion.files)}"
+    return {"motion": motion, **(far if len(by_alpha) > 1 else {}), "trained": trained}
+
+
+def _draw_alphas(folder: Path, by_alpha: dict[str, Animation]) -> Path:
+    """Draw a motion at every alpha, each in a row, and return the file."""
+    rows = {f"alpha {name}": each for name, each in by_alpha.items()}
+    pictures.contact_sheet(drawn := folder / "alphas.png", rows, frames=_moments(_apart(by_alpha)), tile=TILE)
+    return drawn
+
+
+def _apart(by_alpha: dict[str, Animation]) -> np.ndarray:
+    """Return how far the garment at the least alpha is from that at the largest, the mean over its vertices (frames,), m."""
+    each = list(by_alpha.values())
+    low, high = each[0], each[-1]
+    return np.linalg.norm(np.asarray(high.garment, np.float32) - low.garment, axis=2).mean(axis=1)
+
+
+def _moments(apart: np.ndarray) -> list[int]:
+    """Return the frames to show: of `MOMENTS` stretches of a motion, each the one in which the alphas are farthest apart."""
+    stretches = np.array_split(np.arange(len(apart)), min(MOMENTS, len(apart)))
+    return [int(some[apart[some].argmax()]) for some in stretches]
 
 
 def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
