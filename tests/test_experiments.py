@@ -151,14 +151,23 @@ def test_the_page_is_what_its_tables_say():
     assert whole.page(folder / "results") == (folder / "README.md").read_text()
 
 
-def test_methods(alone, tmp_path):
-    rows = studied(methods, tmp_path, text=FREE)
-    assert list(rows) == ["simulation", "pbns", "snug", "ncs"]
-    assert float(rows["simulation"]["distance"]) == 0 and float(rows["simulation"]["dynamic_share"]) == 1
+def test_methods(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "COARSE", 50.0)  # g: what few iterations reach, and stop at
+    rows = studied(methods, tmp_path, text=FREE.replace("smoothing = 2", 'smoothing = 2\npins = "pins"'))
+    assert list(rows) == [*methods.SIMULATIONS.values(), "pbns", "snug", "ncs"]
+    ours, coarse, static, pbns, snug, ncs = rows.values()
+    assert float(ours["distance"]) == 0 and float(ours["dynamic_share"]) == 1
     assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")
+    # what stands beside every distance is that of the second simulation, whose static part is the one without inertia
+    assert {row["sensitivity"] for row in rows.values()} == {coarse["distance"]}
+    assert [float(row["static_distance"]) for row in (ours, coarse, static)] == [0, 0, 0]
+    assert float(ours["dynamic_correlation"]) == pytest.approx(1) == float(ours["dynamic_factor"])
+    # a pose alone has no dynamic part, and a recurrence no part that is static
+    assert float(pbns["static_distance"]) > 0 and not pbns["dynamic_correlation"] and not static["dynamic_factor"]
+    assert not snug["static_distance"] and -1 <= float(ncs["dynamic_correlation"]) <= 1
     # the motion stops: a pose without motion stands at once
     assert float(rows["pbns"]["stopped_share"]) == 0 < float(rows["snug"]["stopped_share"])
-    assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == 1
+    assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == len(methods.SIMULATIONS)
 
 
 @pytest.mark.slow
