@@ -196,6 +196,7 @@ Every claim of the method as an experiment on the packaged garments. `make study
 - The section Spread says how much such numbers differ from seed to seed.
 - Minutes are by the clock. Other work on the machine adds to them, such as a second network that is trained at the same time.
   Milliseconds of a frame are those of one network alone.
+- Not a part of it is `python -m experiments.garments`: any folder of garments for a body, in the columns of HOOD.
 {EARLIER}"""
     parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
     return "\n".join(filter(None, parts))

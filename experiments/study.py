@@ -185,11 +185,14 @@ def references(scenes: Iterable[Scene], motions: Sequence[str], kept: Path) -> N
     abreast(list(jobs.values()))
 
 
-def trained(scene: Scene, steps: int, kept: Path) -> tuple[Run, float]:
-    """The scene's network after so many steps, and how many minutes they took: trained once, and read after that."""
-    folder = kept / "trained" / named(scene.to_dict(), steps)
+def trained(scene: Scene, steps: int, kept: Path, minutes: float | None = None) -> tuple[Run, float]:
+    """The scene's network after so many steps or minutes, and how many minutes it took: trained once, and read after that."""
+    told = [steps] if minutes is None else ["minutes", minutes]
+    folder = kept / "trained" / named(scene.to_dict(), *told)
     with one_at_a_time(folder):
-        run = train(scene, folder, steps=steps, resume=(folder / "run.json").exists())
+        begun = (folder / "run.json").exists()
+        length: dict = {"steps": steps} if minutes is None else {} if begun else {"minutes": minutes}
+        run = train(scene, folder, resume=begun, **length)
     with (folder / "log.csv").open(newline="") as file:
         seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
     return run, seconds[-1] / 60
