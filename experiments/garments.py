@@ -107,15 +107,16 @@ class Task:
 def garment_files(places: Sequence[str], others: Sequence[str]) -> list[Path]:
     """The mesh files of folders, and files that are named themselves; but the body and the motions."""
     taken = {Path(name).resolve() for name in others}
-    found: list[Path] = []
+    found: dict[Path, Path] = {}  # by where it really lies, so that none is there twice
     for folder in map(Path, places):
         if not folder.exists():
             raise InputError("a folder of garments, or one garment, expected", file=folder, mend="check the path")
         files = sorted(folder.iterdir()) if folder.is_dir() else [folder]
-        found += [f for f in files if f == folder or (f.suffix.lower() in FORMATS and f.resolve() not in taken)]
+        meshes = [f for f in files if f == folder or (f.suffix.lower() in FORMATS and f.resolve() not in taken)]
+        found |= {f.resolve(): f for f in meshes if f.resolve() not in found}
     if not found:
         raise InputError(f"a mesh file expected, {', '.join(FORMATS)}", field="FOLDER", value=" ".join(map(str, places)))
-    return found
+    return list(found.values())
 
 
 def placed(files: Sequence[Path], body: io.BodyRecord) -> Iterator[tuple[Path, Placement | InputError]]:

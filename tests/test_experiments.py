@@ -225,7 +225,7 @@ def test_garments_of_a_folder_become_scenes(tmp_path, capsys):
     (worn / "broken.obj").write_text("v 0 0\n")
     (worn / "notes.txt").write_text("")
     np.savez(worn / "swing.npz", **swing())
-    files = garments.garment_files([str(worn)], [str(worn / "swing.npz")])
+    files = garments.garment_files([str(worn), str(worn / "a.npz")], [str(worn / "swing.npz")])
     assert [file.name for file in files] == ["a.npz", "b.npz", "broken.obj", "skirt.npz"]
     plain = scene_from({"body": {"file": str(body)}, "motion": {"files": [str(worn / "swing.npz")]}})
     scenes, refused = garments.scenes_of(files, plain, read_body(body), tmp_path / "kept")
