@@ -244,23 +244,22 @@ def experiment(scenes: dict[str, Scene], methods: Sequence[str], task: Task, out
     if beside:
         jobs = [(name, scene, motion) for motion in task.measured for name, scene in scenes.items()]
         faults = abreast([(simulated, scene, motion, task.kept) for _, scene, motion in jobs])
-        refused = {f"{name}, {motion}": fault for (name, _, motion), fault in zip(jobs, faults, strict=True) if fault}
-        lost = {name for (name, *_), fault in zip(jobs, faults, strict=True) if fault}
-        scenes = {name: scene for name, scene in scenes.items() if name not in lost}
+        refused = {name: f"{name}: {fault}" for (name, *_), fault in zip(jobs, faults, strict=True) if fault}
+        scenes = {name: scene for name, scene in scenes.items() if name not in refused}
     todo = [(name, method) for name in scenes for method in methods]
     results = abreast([(measured, name, scenes[name], method, beside, task) for name, method in todo])
     rows: list[dict] = []
     drawn: dict[str, dict[str, np.ndarray]] = {}
     for (name, method), result in zip(todo, results, strict=True):
         if isinstance(result, str):
-            refused[f"{name}, {method}"] = result
+            refused[f"{name}, {method}"] = f"{name}, {method}: {result}"
             continue
         rows += result[0]
         drawn.setdefault(name, {})[method] = result[1]
     for name, animations in drawn.items():
         apart(draw, out / f"{name}.png", scenes[name], task.measured[0], animations)
-    for name, fault in refused.items():
-        print(f"not used: {name}: {fault}", file=sys.stderr)
+    for fault in refused.values():
+        print(f"not used: {fault}", file=sys.stderr)
     return rows, refused
 
 
@@ -294,7 +293,7 @@ def main(given: Sequence[str] | None = None) -> int:
     write_csv(o.out / "garments.csv", rows)
     table = o.out / "garments.md"
     write_markdown(table, [row for row in rows if row["motion"] == ALL], COLUMNS)
-    text = table.read_text() + "".join(f"\nNot used: {name}: {why}\n" for name, why in refused.items())
+    text = table.read_text() + "".join(f"\nNot used: {why}\n" for why in refused.values())
     table.write_text(text)
     print(text, end="")
     return 0
