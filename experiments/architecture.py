@@ -31,6 +31,8 @@ from experiments.study import (
     fitted,
     judged_on,
     recurrent,
+    references,
+    still,
     trained,
     without,
     write,
@@ -177,13 +179,14 @@ def measured(scene: Scene, network: str | Callable, unseen: Sequence[str], steps
     cell = network if isinstance(network, str) else "gated"
     scene = changed(scene, network={"cell": cell}) if cell == "swing" else recurrent(scene, cell)
     run, minutes = trained(scene, steps, kept) if isinstance(network, str) else fitted(scene, network, steps)
-    found = judged_on(run, unseen, [run.animate(motion) for motion in unseen], kept)
+    found = judged_on(run, unseen, [run.animate(motion) for motion in unseen], still(run, unseen[0]), kept)
     return found | {"minutes": minutes} | rest(run, unseen[0])
 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
+    references([scene], unseen, kept)
     found = abreast([(measured, scene, network, unseen, steps, kept) for network in ARCHITECTURES.values()])
     rows = [{"network": name, **row} for name, row in zip(ARCHITECTURES, found, strict=True)]
     left = {row["network"]: row.pop("left") for row in rows}

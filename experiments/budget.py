@@ -23,7 +23,8 @@ from experiments.study import (
     judged,
     networks,
     recurrent,
-    reference,
+    references,
+    still,
     trained,
     without,
     write,
@@ -40,7 +41,7 @@ def used(scene: Scene, motion: str, steps: int, kept: Path) -> list[dict]:
     for fps in RATES:
         other = assemble(changed(scene, motion={"fps": fps}), prepared=run.assembly.prepared)
         there = replace(run, assembly=other)
-        row = judged(there, motion, there.animate(motion), reference(other.scene, motion, kept))
+        row = judged(there, motion, there.animate(motion), still(there, motion), kept)
         rows.append({"change": f"trained at {scene.motion.fps:g} frames/s, used at {fps:g}", **row, "minutes": minutes})
     return rows
 
@@ -56,7 +57,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     scenes |= {f"{n} of {len(files)} motions": changed(scene, motion={"files": files[-n:]}) for n in counts}
     rows = networks(scenes, unseen, steps, kept, "change")
     at = {fps: changed(scene, motion={"fps": fps}) for fps in RATES}
-    abreast([(reference, at[fps], unseen[0], kept) for fps in sorted(RATES, reverse=True)])
+    references([at[fps] for fps in sorted(RATES, reverse=True)], unseen[:1], kept)
     for found in abreast([(used, at[fps], unseen[0], steps, kept) for fps in RATES]):
         rows += found
     write(out, "budget", rows, {"change": "", **COLUMNS})

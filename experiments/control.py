@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.study import apart, command, judged_on, lines, trained, without, write
+from experiments.study import apart, command, judged_on, lines, references, still, trained, without, write
 from ncs_jax import Scene
 
 ALPHAS = np.arange(0, 3.01, 0.25)
@@ -29,6 +29,9 @@ COLUMNS = {
     "penetrating": "inside, %",
     "total": "energy, J",
     "distance": "mm to simulation",
+    "sensitivity": "two simulations, mm",
+    "dynamic_correlation": "dynamic correlation",
+    "dynamic_factor": "dynamic factor",
     "stopped_share": "after a stop",
     "usable": "usable",
 }
@@ -37,14 +40,16 @@ COLUMNS = {
 def measured(scene: Scene, motions: Sequence[str], steps: int, kept: Path) -> list[dict]:
     """A row for each alpha."""
     run, _ = trained(scene, steps, kept)
-    return [
-        {"alpha": float(a), **judged_on(run, motions, [run.animate(motion, a) for motion in motions], kept)} for a in ALPHAS
-    ]
+    static = still(run, motions[0])
+    animations = {float(a): [run.animate(motion, a) for motion in motions] for a in ALPHAS}
+    return [{"alpha": a, **judged_on(run, motions, found, static, kept)} for a, found in animations.items()]
 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
-    rows = apart(measured, without(scene, unseen), unseen, steps, kept)
+    scene = without(scene, unseen)
+    references([scene], unseen, kept)
+    rows = apart(measured, scene, unseen, steps, kept)
     strain = next(row["strain_mean"] for row in rows if row["alpha"] == 1)
     for row in rows:
         good = row.get("penetrating", 0) <= INSIDE and row["strain_mean"] <= STRAIN * strain

@@ -19,7 +19,20 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.study import abreast, bars, changed, command, fitted, judged, recurrent, reference, trained, without, write
+from experiments.study import (
+    abreast,
+    bars,
+    changed,
+    command,
+    fitted,
+    judged,
+    recurrent,
+    references,
+    still,
+    trained,
+    without,
+    write,
+)
 from ncs_jax import Run, Scene, local_rotations
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.network.methods.method import Method
@@ -33,9 +46,12 @@ COLUMNS = {
     "descriptor": "",
     "unseen_total": "unseen: energy, J",
     "unseen_distance": "mm to simulation",
+    "unseen_sensitivity": "two simulations, mm",
+    "unseen_static_distance": "static part, mm",
     "unseen_hem_correlation": "hem correlation",
     "seen_total": "seen: energy, J",
     "seen_distance": "mm to simulation ",
+    "seen_sensitivity": "two simulations, mm ",
     "turned": f"turned by {TURN:.0f} degrees: mm from the turned result",
     "turned_total": "energy there, J",
 }
@@ -85,7 +101,7 @@ def measured(scene: Scene, unseen: str, steps: int, kept: Path, blind: bool) -> 
     run, minutes = fitted(scene, without_gravity, steps) if blind else trained(scene, steps, kept)
     row: dict[str, float] = {"minutes": minutes}
     for name, motion in (("unseen", unseen), ("seen", scene.motion.files[-1])):
-        found = judged(run, motion, run.animate(motion), reference(scene, motion, kept))
+        found = judged(run, motion, run.animate(motion), still(run, motion), kept)
         row |= {f"{name}_{key}": value for key, value in found.items()}
     turn, way = turned(run, unseen)
     away = run.animate(way) - run.animate(unseen).astype(np.float64) @ turn.T
@@ -98,6 +114,8 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     scene = recurrent(without(scene, unseen))
     cases = {name: (name, False) for name in DESCRIPTORS} | {"six, gravity not seen": ("six", True)}
     scenes = [(changed(scene, network={"descriptor": name}), blind) for name, blind in cases.values()]
+    references([scene], unseen[:1], kept)
+    references([scene], scene.motion.files[-1:], kept)
     found = abreast([(measured, one, unseen[0], steps, kept, blind) for one, blind in scenes])
     rows = [{"descriptor": name, **row} for name, row in zip(cases, found, strict=True)]
     write(out, "descriptors", rows, COLUMNS)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.fit_material import sheet
-from experiments.study import COLUMNS, abreast, axes_of, changed, command, networks, reference, without, write
+from experiments.study import COLUMNS, axes_of, changed, command, networks, references, without, write
 from ncs_jax import Scene
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.geometry.mesh import mesh_from
@@ -57,7 +57,7 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     forces = pressed(scene)
     scene = without(scene, unseen)
     scenes = {name: changed(scene, physics={"membrane": {"model": name}}) for name in MEMBRANES}
-    abreast([(reference, scene, unseen[0], kept) for scene in reversed(scenes.values())])  # the last takes longest
+    references(reversed(scenes.values()), unseen[:1], kept)  # the last takes longest
     rows = networks(scenes, unseen[:1], steps, kept, "model")
     rows = [row | limits(forces[row["model"]]) for row in rows]
     write(out, "membranes", rows, {"model": "", **COLUMNS, **YIELDS})

@@ -4,7 +4,9 @@
 
 Every network is trained on the scene's motions but the unseen ones, two at a time, and judged on those beside the
 simulation: energies, strain, penetration and how it moves (`ncs_jax.metrics.motion.MEASURES`), after a stop on the first
-motion that has one. Writes methods.csv, .md and .png, a strip of the same frames of all four for each motion.
+motion that has one. On the first motion the simulation also stands beside a second one of itself, which is less exact, and one
+without inertia, the equilibrium of every pose, from which the static part of every method is measured. Writes methods.csv, .md
+and .png, a strip of the same frames of all methods for each motion.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import numpy as np
 
 from experiments.speed_accuracy import streamed
 from experiments.study import (
+    COARSE,
     COLUMNS,
     abreast,
     apart,
@@ -27,7 +30,9 @@ from experiments.study import (
     judged_on,
     recurrent,
     reference,
+    references,
     stem,
+    still,
     trained,
     without,
     write,
@@ -36,6 +41,7 @@ from ncs_jax import Run, Scene, assemble
 from ncs_jax.metrics.motion import stops
 
 METHODS = ("pbns", "snug", "ncs")
+SIMULATIONS = {"dynamic": "simulation", "coarse": f"simulation, to {COARSE:g} g", "static": "simulation without inertia"}
 RECURRENT = "ncs, gated"  # beside NCS with the garment's own swing, if that is the scene's
 
 
@@ -43,7 +49,7 @@ def learned(name: str, scene: Scene, unseen: Sequence[str], steps: int, kept: Pa
     """Train the scene's method: its row, so named, and its animations of the unseen motions."""
     run, minutes = trained(scene, steps, kept)
     found = [run.animate(motion) for motion in unseen]
-    return {"method": name, **judged_on(run, unseen, found, kept), "minutes": minutes}, found
+    return {"method": name, **judged_on(run, unseen, found, still(run, unseen[0]), kept), "minutes": minutes}, found
 
 
 def streaming(scenes: Sequence[Scene], motion: str, steps: int, kept: Path) -> list[float]:
@@ -51,11 +57,12 @@ def streaming(scenes: Sequence[Scene], motion: str, steps: int, kept: Path) -> l
     return [1e3 * streamed(trained(scene, steps, kept)[0], motion) for scene in scenes]
 
 
-def simulated(scene: Scene, unseen: Sequence[str], kept: Path) -> tuple[dict, list[np.ndarray]]:
-    """The simulation, judged like the others."""
-    found = [reference(scene, motion, kept) for motion in unseen]
-    run = Run(assemble(scene.without_network()), {})
-    return {"method": "simulation", **judged_on(run, unseen, found, kept)}, found
+def simulated(scene: Scene, unseen: Sequence[str], kept: Path, twin: str) -> tuple[dict, list[np.ndarray]]:
+    """A simulation, judged like the others: that to `BALANCE` on all motions, any other on the first."""
+    motions = unseen if twin == "dynamic" else unseen[:1]
+    found = [reference(scene, motion, kept, twin) for motion in motions]
+    run, static = Run(assemble(scene.without_network()), {}), reference(scene, unseen[0], kept, "static")
+    return {"method": SIMULATIONS[twin], **judged_on(run, motions, found, static, kept)}, found
 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path, name: str = "methods") -> list[dict]:
@@ -64,17 +71,20 @@ def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept:
     scenes = {method: changed(scene, network={"method": method}) for method in METHODS}
     if scene.network.cell == "swing":
         scenes[RECURRENT] = recurrent(scenes["ncs"])
-    abreast([(reference, scene, motion, kept) for motion in unseen])
-    made = [apart(simulated, scene, unseen, kept)]
+    references([scene], unseen, kept)
+    made = [apart(simulated, scene, unseen, kept, twin) for twin in SIMULATIONS]
     made += abreast([(learned, method, one, unseen, steps, kept) for method, one in scenes.items()])
     rows = [row for row, _ in made]
     frames = apart(streaming, list(scenes.values()), unseen[0], steps, kept)  # with both cores to itself
-    rows[1:] = [row | {"frame": ms} for row, ms in zip(rows[1:], frames, strict=True)]
+    count = len(SIMULATIONS)
+    rows[count:] = [row | {"frame": ms} for row, ms in zip(rows[count:], frames, strict=True)]
     write(out, name, rows, {"method": "", **COLUMNS, "lag": "lag, s", "frame": "ms a frame"})
     run = Run(assemble(scene.without_network()), {})
     for k, motion in enumerate(unseen):
         file = out / f"{name}_{stem(motion)}.png"
-        draw(file, run, motion, {row["method"]: animations[k] for row, animations in made})
+        shown = {row["method"]: animations[k] for row, animations in made if len(animations) > k}
+        shown.pop(SIMULATIONS["coarse"], None)  # nobody sees a difference
+        draw(file, run, motion, shown)
     return rows
 
 
@@ -118,6 +128,15 @@ def conclusion(rows: Sequence[dict]) -> str:
         text += f"; after a stop NCS still moves ({ncs['stopped_share']:.2f}), PBNS stands ({pbns['stopped_share']:.2f})"
         times = [f"{row['settling']:.2f} s" if "settling" in row else "longer than it was looked at" for row in (ncs, sim)]
         text += f", and NCS settles in {times[0]} where the simulation takes {times[1]}"
+    if "sensitivity" in ncs:
+        static = by[SIMULATIONS["static"]]
+        text += (
+            f". Two simulations are {ncs['sensitivity']:.1f} mm apart, one without inertia is {static['distance']:.1f} mm off"
+        )
+        text += f"; from that the static part of NCS is {ncs['static_distance']:.1f} mm, PBNS {pbns['static_distance']:.1f} mm"
+        if "dynamic_factor" in ncs:
+            text += f"; the dynamic part of NCS correlates with the true one by {ncs['dynamic_correlation']:.2f}"
+            text += f" and is nearest to it {ncs['dynamic_factor']:.2f} times as large"
     if RECURRENT in by:
         gated = by[RECURRENT]
         text += f". With a gated unit in place of the swing: {gated['dynamic_share']:.2f}"

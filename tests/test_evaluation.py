@@ -77,6 +77,7 @@ def test_depth_and_share_of_what_is_inside(assembly):
     assert "middle_depth_max" not in fast
     # The next columns are half a millimetre outside a side, and inside the plane through its corner.
     np.testing.assert_allclose(fast["penetrating"], [0, 60], atol=1e-5)
+    np.testing.assert_allclose(rows["within_1mm"], [0, 60], atol=1e-5)
 
 
 def test_skin_between_vertices(assembly):

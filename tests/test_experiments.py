@@ -17,6 +17,7 @@ from experiments import (
     falling,
     fast_motion,
     fit_material,
+    garments,
     membranes,
     methods,
     seeds,
@@ -26,11 +27,12 @@ from experiments import (
     stability,
     study,
 )
-from ncs_jax import InputError, assemble, load_scene
+from ncs_jax import InputError, assemble, load_scene, scene_from
 from ncs_jax.io import read_body, read_motion
 from ncs_jax.io.packaged import packaged
 
-from .scenes import FREE, SCENE, swing, write_scene
+from .scenes import FREE, SCENE, post, swing, write_scene
+from .shapes import tube
 
 
 @pytest.fixture(autouse=True)
@@ -84,9 +86,9 @@ def test_speed_accuracy(tmp_path, capsys):
 @pytest.fixture
 def alone(monkeypatch):
     """Everything in this process: starting others takes longer than what they do here."""
-    for module in (control, methods):
+    for module in (control, garments, methods):
         monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
-    for module in (study, methods, architecture, budget, descriptors):
+    for module in (study, garments, methods, architecture, budget, descriptors):
         monkeypatch.setattr(module, "abreast", lambda jobs: [job(*arguments) for job, *arguments in jobs])
 
 
@@ -151,14 +153,94 @@ def test_the_page_is_what_its_tables_say():
     assert whole.page(folder / "results") == (folder / "README.md").read_text()
 
 
-def test_methods(alone, tmp_path):
-    rows = studied(methods, tmp_path, text=FREE)
-    assert list(rows) == ["simulation", "pbns", "snug", "ncs"]
-    assert float(rows["simulation"]["distance"]) == 0 and float(rows["simulation"]["dynamic_share"]) == 1
+def test_methods(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "COARSE", 50.0)  # g: what few iterations reach, and stop at
+    rows = studied(methods, tmp_path, text=FREE.replace("smoothing = 2", 'smoothing = 2\npins = "pins"'))
+    assert list(rows) == [*methods.SIMULATIONS.values(), "pbns", "snug", "ncs"]
+    ours, coarse, static, pbns, snug, ncs = rows.values()
+    assert float(ours["distance"]) == 0 and float(ours["dynamic_share"]) == 1
     assert all(float(row["distance"]) > 0 for name, row in rows.items() if name != "simulation")
+    # what stands beside every distance is that of the second simulation, whose static part is the one without inertia
+    assert {row["sensitivity"] for row in rows.values()} == {coarse["distance"]}
+    assert [float(row["static_distance"]) for row in (ours, coarse, static)] == [0, 0, 0]
+    assert float(ours["dynamic_correlation"]) == pytest.approx(1) == float(ours["dynamic_factor"])
+    # a pose alone has no dynamic part, and a recurrence no part that is static
+    assert float(pbns["static_distance"]) > 0 and not pbns["dynamic_correlation"] and not static["dynamic_factor"]
+    assert not snug["static_distance"] and -1 <= float(ncs["dynamic_correlation"]) <= 1
     # the motion stops: a pose without motion stands at once
     assert float(rows["pbns"]["stopped_share"]) == 0 < float(rows["snug"]["stopped_share"])
-    assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == 1
+    assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == len(methods.SIMULATIONS)
+
+
+def write_sleeve(file, radius=0.085, bottom=0.5, unit=1.0):
+    """A tube around the post: of 85 mm it lies on it, and of 100 mm it hangs."""
+    x, faces = tube(16, 6, radius, 0.2)
+    np.savez(file, vertices=(x + [0, bottom, 0]) / unit, faces=faces)
+
+
+@pytest.mark.slow  # nearly all of it is compiling
+def test_garments(alone, tmp_path, capsys):
+    np.savez(tmp_path / "body.npz", **post())
+    np.savez(tmp_path / "swing.npz", **swing())
+    np.savez(tmp_path / "still.npz", **swing(size=0.1))
+    (tmp_path / "worn").mkdir()
+    write_sleeve(tmp_path / "worn" / "sleeve.npz")
+    (tmp_path / "worn" / "broken.obj").write_text("v 0 0\n")
+    command = [
+        str(tmp_path / "worn"),
+        "--body",
+        str(tmp_path / "body.npz"),
+        "--motions",
+        str(tmp_path / "swing.npz"),
+        "--quick",
+    ]
+    command += ["--methods", "simulation", "pbns", "--out", str(tmp_path / "out"), "--kept", str(tmp_path / "kept")]
+    assert garments.main([*command, "--unseen", str(tmp_path / "still.npz")]) == 0
+    with (tmp_path / "out" / "garments.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {(r["garment"], r["method"], r["on"]) for r in rows} == {
+        ("sleeve", method, on) for method in ("simulation", "pbns") for on in ("trained", "unseen")
+    }
+    every = [r for r in rows if r["motion"] == garments.ALL]
+    assert len(rows) == 2 * len(every) == 8
+    energies = ("membrane", "bending", "inertia", "gravity", "collision")
+    for row in every:
+        assert float(row["total"]) == pytest.approx(sum(float(row[name]) for name in (*energies, "pinning") if name in row))
+        assert 0 <= float(row["penetrating"]) <= float(row["within_1mm"]) <= 100 and float(row["gradient_norm"]) > 0
+        assert (float(row["distance"]) == 0) == (row["method"] == "simulation")
+    told = (tmp_path / "out" / "garments.md").read_text()
+    assert told.count("| sleeve |") == 4 and "broken.obj" in told and "broken.obj" in capsys.readouterr().err
+    assert (tmp_path / "out" / "sleeve.png").read_bytes()[:4] == b"\x89PNG"
+    (tmp_path / "worn" / "sleeve.npz").unlink()
+    assert garments.main(command) == 2 and garments.main([str(tmp_path / "nowhere"), *command[1:]]) == 2
+
+
+def test_garments_of_a_folder_become_scenes(tmp_path, capsys):
+    """One that hangs is placed as the others if these agree; one that cannot be read is told by name, and the others go on."""
+    body, worn = tmp_path / "body.npz", tmp_path / "worn"
+    np.savez(body, **post())
+    worn.mkdir()
+    for name, radius, bottom in (("a", 0.085, 0.5), ("b", 0.085, 0.45), ("skirt", 0.1, 0.3)):
+        write_sleeve(worn / f"{name}.npz", radius, bottom)
+    (worn / "broken.obj").write_text("v 0 0\n")
+    (worn / "notes.txt").write_text("")
+    np.savez(worn / "swing.npz", **swing())
+    files = garments.garment_files([str(worn), str(worn / "a.npz")], [str(worn / "swing.npz")])
+    assert [file.name for file in files] == ["a.npz", "b.npz", "broken.obj", "skirt.npz"]
+    plain = scene_from({"body": {"file": str(body)}, "motion": {"files": [str(worn / "swing.npz")]}})
+    scenes, refused = garments.scenes_of(files, plain, read_body(body), tmp_path / "kept")
+    assert list(scenes) == ["a", "b", "skirt"] and list(refused) == [str(worn / "broken.obj")]
+    physics = scenes["skirt"].physics
+    # 23.6 and 44.4 kPa times 0.47 mm
+    assert (physics.density, physics.membrane.mu, physics.membrane.lam) == pytest.approx((0.20022, 11.092, 20.868))
+    x = np.load(scenes["skirt"].garment.file)["vertices"]
+    assert np.abs(np.linalg.norm(x[:, [0, 2]], axis=1) - 0.1).max() < 0.005 and abs(x[:, 1].min() - 0.3) < 0.005
+    told = capsys.readouterr().err
+    assert "skirt.npz: placed as the others" in told and "not used: " in told and "broken.obj" in told
+    found = dict(garments.placed([worn / "a.npz", worn / "skirt.npz"], read_body(body)))
+    assert found[worn / "skirt.npz"].doubt  # one alone says nothing of it
+    with pytest.raises(InputError, match="mesh file"):
+        garments.garment_files([str(tmp_path / "kept")], [])
 
 
 @pytest.mark.slow

@@ -43,12 +43,16 @@ QUANTITIES = {
     "shear_mean": ("deg", "mean deviation of warp and weft from a right angle, by area"),
     "hinge_mean": ("deg", "mean |phi - phi_rest| over the hinges"),
     "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
+    "within_1mm": ("%", "vertices inside the body or nearer to it than 1 mm"),
     "depth_max": ("mm", "deepest penetration"),
     "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
     "outside": ("%", "frames beyond the poses and speeds that the network was trained on"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
+    "gradient_norm": ("N", "mean length of a vertex's row of grad E"),
 }
+
+INSIDE = {"penetrating": 0.0, "within_1mm": -0.001}  # m of depth from which on a vertex counts
 
 
 class _Frames(NamedTuple):
@@ -97,7 +101,8 @@ def _energies_and_shape(model: Model, frames: _Frames) -> dict[str, Float[Array,
         if terms.gravity:
             lifted = gravity(origin[None], jnp.sum(mass, keepdims=True), model.material.gravity)
             total, parts = total + lifted, {**parts, "gravity": parts["gravity"] + lifted}
-        return {"total": total, **parts, **_shape(model, frame.x), "out_of_balance": out_of_balance(gradient, mass)}
+        left = {"out_of_balance": out_of_balance(gradient, mass), "gradient_norm": jnp.mean(jnp.linalg.norm(gradient, axis=1))}
+        return {"total": total, **parts, **_shape(model, frame.x), **left}
 
     return lax.map(one, frames.seen_from_root())
 
@@ -120,7 +125,8 @@ def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict
         if surface is not None:
             parts["middle_depth_max"] = depth[verts:]
         deepest = {name: 1000 * jnp.maximum(jnp.max(part), 0) for name, part in parts.items()}
-        return {"penetrating": 100 * jnp.mean(depth[:verts] > 0), **deepest}
+        shares = {name: 100 * jnp.mean(depth[:verts] > least) for name, least in INSIDE.items()}
+        return {**shares, **deepest}
 
     return lax.map(one, frames.seen_from_root()[0])
 
@@ -226,7 +232,7 @@ def measure_on_host(
     points = np.stack([with_middles(frame, edges) for frame in x]) if middles else x
     depths = depths_on_host(points, skin, np.asarray(model.surface.faces), layered=bool(model.under))
     own = x.shape[1]
-    rows["penetrating"] = 100 * (depths[:, :own] > 0).mean(axis=1)
+    rows |= {name: 100 * (depths[:, :own] > least).mean(axis=1) for name, least in INSIDE.items()}
     for name, part in (("depth_max", depths[:, :own]), ("middle_depth_max", depths[:, own:])):
         if part.size:
             rows[name] = 1000 * np.maximum(part.max(axis=1), 0)
