@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import ncs_jax
 from ncs_jax.io import read_body
 from ncs_jax.io.packaged import packaged
-from ncs_jax.prepare.setting import load_motion
+from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.scene.spec import MotionSpec, Scene
 from ncs_jax.view.character import body_vertices
 from tools.make_recordings import CUTS, make_recording

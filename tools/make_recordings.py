@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.io import BodyRecord
-from ncs_jax.prepare.setting import load_motion
+from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 POSE_BITS, PATH_BITS = 15, 16  # rounded to 2^-15 rad and 2^-16 m: together below 0.1 mm
@@ -49,7 +49,7 @@ def make_recording(body: BodyRecord, file: Path, cut: list[int]) -> dict[str, np
     return {
         "poses": _rounded(poses, POSE_BITS),
         "trans": _rounded(path, PATH_BITS),
-        "fps": np.float32(motion.fps),
+        "fps": np.asarray(motion.fps, np.float32),
         "joint_names": np.array(body.joint_names),
     }
 
