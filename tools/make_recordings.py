@@ -49,7 +49,7 @@ def make_recording(body: BodyRecord, file: Path, cut: list[int]) -> dict[str, np
     return {
         "poses": _rounded(poses, POSE_BITS),
         "trans": _rounded(path, PATH_BITS),
-        "fps": np.float32(motion.fps),
+        "fps": np.array(motion.fps, np.float32),
         "joint_names": np.array(body.joint_names),
     }
 
