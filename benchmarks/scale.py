@@ -80,15 +80,19 @@ def _played(motion: io.MotionRecord, frames: int, rng: np.random.Generator) -> t
 
 def point(scene: Scene, repeats: int) -> dict:
     """A scene, measured in this process, as `train` takes it up."""
-    peaks, seconds, began = {}, {}, time.perf_counter()
+    peaks, seconds, began = {}, {}, np.zeros(2)
+
+    def clocks() -> np.ndarray:
+        return np.array([time.perf_counter(), time.process_time()])
 
     def stage(name: str) -> None:
         nonlocal began
-        peaks[name], seconds[name] = peak_memory() >> 20, time.perf_counter() - began
+        peaks[name], seconds[name] = peak_memory() >> 20, clocks() - began
         forget_peak()
-        began = time.perf_counter()
+        began = clocks()
 
     forget_peak()
+    began = clocks()
     stage("start")
     assembly = assemble(scene)
     trim_memory()
@@ -102,17 +106,17 @@ def point(scene: Scene, repeats: int) -> dict:
     stage("step, compiled")
     each, spec = [], scene.training
     for chunk in range(repeats + 1):
-        start, used = time.perf_counter(), time.process_time()
+        start = clocks()
         state, _ = placed.run_chunk(state, chunk * CHUNK, CHUNK, spec.steps)
         jax.block_until_ready(state)
-        each.append([(time.perf_counter() - start) / CHUNK, (time.process_time() - used) / CHUNK])
+        each.append((clocks() - start) / CHUNK)
     stage("steps")
     renewed = []
     for number in range(1, 3):
-        start, used = time.perf_counter(), time.process_time()
+        start = clocks()
         placed.refresh(state.params, number * spec.checkpoint_every)
         jax.block_until_ready(placed.features)
-        renewed.append([time.perf_counter() - start, time.process_time() - used])
+        renewed.append(clocks() - start)
     stage("refresh")
     placed.rebuild_lists(state.params)
     stage("lists")
@@ -155,8 +159,10 @@ def show(figures: dict) -> str:
     first = next(iter(points.values()))
     rows = [[f"peak MB, {stage}", *(p["peaks"][stage] for p in points.values())] for stage in first["peaks"]]
     rows.append(["peak MB", *(max(p["peaks"].values()) for p in points.values())])
-    rows += [[f"s, {stage}", *(p["seconds"][stage] for p in points.values())] for stage in first["seconds"]]
     for number, clock in enumerate(("wall", "processor")):
+        rows += [
+            [f"s, {stage}, {clock}", *(p["seconds"][stage][number] for p in points.values())] for stage in first["seconds"]
+        ]
         rows.append([f"ms a step, {clock}", *(p["ms a step"][number] for p in points.values())])
         rows.append([f"s a refresh, {clock}", *(p["refresh"][number] for p in points.values())])
         rows.append([f"% of training, {clock}", *(p["share"][number] for p in points.values())])

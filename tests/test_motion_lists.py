@@ -46,6 +46,7 @@ def test_a_folder_stands_for_all_motions_in_it_and_says_what_is_none(folder):
     for kind in ("1 shape.npz", "1 neutral_stagei.npz", "1 *.npz", "1 *.txt"):
         assert kind in found.found[0]
     assert scene(folder, "motions/A/s 1/walk_poses.npz").motion.found == ()
+    assert scene(folder, "", "motions/none.npz").motion.files == ("", "motions/none.npz")  # reading says what is wrong
 
 
 def test_patterns_frames_and_settings_reach_each_motion(folder):

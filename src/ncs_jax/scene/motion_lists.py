@@ -99,7 +99,7 @@ def _left_out(skipped: Counter) -> str:
 
 def _many(name: str, path: Callable[[str], Path]) -> tuple[list[str], Counter] | None:
     """Return the motions that a name stands for, and what else was there by kind; None where it names one file."""
-    if name.startswith("ncs:"):
+    if not name or name.startswith("ncs:"):
         return None
     file, frames = split_frames(os.path.expanduser(name))
     there, slices = path(file), "" if frames is None else name.removeprefix(file)
