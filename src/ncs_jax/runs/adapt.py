@@ -126,7 +126,7 @@ def adapt(
         return Adapted(now, told["before"], told["after"], told["seconds"], told["kept"], out)
     programs = Programs()
     begin_programs(programs, begins.assembly, CHUNK)  # while it is measured
-    say("measuring the garment on " + ", ".join(records))
+    say("compiling, and measuring the garment on " + ", ".join(records))
     best = _Best(begins, told.get("before"))
     if now.steps:
         best(now.params)
@@ -134,7 +134,7 @@ def adapt(
     said = {"start": str(Path(run.assembly.scene.source).parent), **_own_facts(run, out), "adapted": told}
     begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since)
     left = None, (seconds - spent) / 60
-    say("compiling")
+    say("compiling what trains it")
     adapted = train_assembly(begins.assembly, out, begun, left, programs=programs, report=report, settle=best)
     told |= {"after": best.measures, "kept": best.measures is not best.before}
     if out is not None:
