@@ -193,7 +193,7 @@ class NetworkSpec:
     dynamic: tuple[int, ...] = _f((256, 256), "layer sizes, dynamic encoder, all joints; snug's encoder", low=1, high=65536)
     cell: str = _f("auto", "what ncs remembers by, see docs/choosing.md", choices=("auto", "gated", "linear", "swing"))
     vibrations: int = _f(12, "number of the garment's vibrations that a swing cell moves", low=1, high=256)
-    damping: float = _f(0.3, "damping of a swing cell, 1/s", low=0, high=1e6)
+    damping: float = _f(1.0, "damping of a swing cell, 1/s", low=0, high=1e6)
     decoder: tuple[int, ...] = _f((256, 256, 256), "layer sizes, decoder", low=1, high=65536)
     modes: int = _f(128, "smooth modes of the garment that the decoder also moves; 0: none", low=0, high=4096)
 
