@@ -716,8 +716,9 @@ def test_a_body_file_that_is_not_one(tmp_path, capsys):
 
 
 def test_the_picture_of_a_check_shows_what_is_at_risk_and_else_what_moves():
-    motion = {name: SimpleNamespace(poses=np.array([[[0.0]], [[size]]])) for name, size in [("a", 0), ("b", 2), ("a[3:9]", 1)]}
-    risk = lambda *names: [SimpleNamespace(value=f"90 degrees in {name}, frame 3") for name in names]  # noqa: E731
+    sizes = {"a": 0, "b": 2, "a[3:9]": 1}
+    motion = {name: SimpleNamespace(poses=np.array([[[0.0]], [[size]]]), uncertain={}) for name, size in sizes.items()}
+    risk = lambda *names: [SimpleNamespace(motion=name) for name in names]  # noqa: E731
     first = lambda *names: check._worst_first([["a", "b"], ["a[3:9]"]], SimpleNamespace(motions=motion), risk(*names))  # noqa: E731
     assert first() == [["b", "a"], ["a[3:9]"]]
     assert first("a") == [["a", "b"], ["a[3:9]"]]

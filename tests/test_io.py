@@ -902,7 +902,7 @@ def test_random_damage_is_read_or_refused(tmp_path, kind):
 def test_packaged_files(path):
     if path.stem == "body":
         assert len(io.read_body(path).joint_names) == 31
-    elif path.stem.startswith(("tshirt", "skirt")):
+    elif path.stem.startswith(("tshirt", "skirt", "dress")):
         assert ("pins" in io.read_garment(path).groups) == path.stem.startswith("skirt")
     else:
         assert io.read_motion(path).poses.shape[1:] == (31, 3)

@@ -52,7 +52,7 @@ NAMES = (
 MEASURED = (
     *("step", "strain", "moved", "dropped", "seconds"),
     *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max", "middle_depth_max"),
-    *("within_1mm", "self_intersecting", "out_of_balance", "gradient_norm", "speed", "lag", "settling", "overshoot"),
+    *("within_1mm", "self_intersecting", "out_of_balance", "gradient_norm", "outside", "speed", "lag", "settling", "overshoot"),
     *("gain", "dynamic_share", "stopped_share", "hem_correlation", "distance"),
     *("static_distance", "dynamic_correlation", "dynamic_factor"),
 )
