@@ -85,7 +85,7 @@ def train(options) -> int:
 
 
 def demo(options) -> int:
-    """Train the packaged dress, draw it and print how it does on a motion that it never saw; a demo that is there goes on."""
+    """Train the packaged dress, draw it and print how it does on a spin; a demo that is there goes on."""
     out = Path(options.out)
     resume = (out / "run.json").exists()
     minutes = options.minutes if options.minutes or resume else DEMO_MINUTES

@@ -21,7 +21,7 @@ from ncs_jax.simulation.ritz_modes import displacement_slopes, stiffness_in_pose
 __all__ = ["learn_pose_stiffness"]
 
 MOST = 128  # poses: by then the map explains 3 quarters of what differs between a skirt's
-FEWEST = 32  # poses that a map is fitted to
+FEWEST = 16  # poses that a map is fitted to
 STEPS = 64  # of training for each pose, so that they take about a twentieth of its time
 RIDGES = 10.0 ** np.arange(-4, 3)  # of the mean square of the descriptors
 
