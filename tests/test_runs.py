@@ -20,6 +20,7 @@ from ncs_jax.network.rollout import stepper
 from ncs_jax.runs.begin import assemble_run
 from ncs_jax.runs.checkpoint import Checkpoints, write_run
 from ncs_jax.runs.plan import EARLY, Costs, steps_within
+from ncs_jax.runs.pose_stiffness import poses_of
 from ncs_jax.runs.run import Run, assemble, load_run
 from ncs_jax.runs.train import train
 from ncs_jax.scene.spec import load_scene
@@ -227,10 +228,13 @@ def test_steps_within_a_time_count_everything_that_takes_time():
             total += 10 * costs.step + (done % costs.validate_every == 0 or done == last) * costs.validation
             total += (done % costs.checkpoint_every == 0 or done == last) * costs.checkpoint
             total += (done % costs.checkpoint_every == 0 or done in EARLY) * costs.lists
+            total += (done in (-(-(last // 2) // 10) * 10, last)) * poses_of(last) * costs.stiffness
         return total
 
     quick, slow = Costs(0.01, 3.0, 1.0, 0.2, 200, 150), Costs(10.0, 60.0, 5.0, 1.0, 20, 200)
-    for costs in (quick, slow):
+    swings = quick._replace(stiffness=0.02)
+    assert steps_within(600, swings) < steps_within(600, quick) - 100
+    for costs in (quick, slow, swings):
         for first in (0, 60, 400):
             for allowed in (1, 100, 600, 3600):
                 last = steps_within(allowed, costs, first)

@@ -17,9 +17,10 @@ from jaxtyping import Array
 from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.errors import required
 from ncs_jax.network.methods.method import Method
+from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import Assembly
-from ncs_jax.runs.pose_stiffness import learn_pose_stiffness
+from ncs_jax.runs.pose_stiffness import find_stiffness, learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.training.batches import batches, whole_chunks
@@ -124,6 +125,11 @@ class PlacedScene:
         self._everywhere = self.copied(self.model), self._everywhere[1]
         self.refresh(params, done)
         return True
+
+    def find_stiffness(self, params: dict) -> None:
+        """Do what finding the stiffness in a pose takes, where the garment swings."""
+        if isinstance(network := self.assembly.network, Swing):
+            find_stiffness(network, params, self.model, self._bare, np.arange(1))
 
     def rebuild_lists(self, params: dict) -> None:
         """Tell the search for the nearest vertex where the garment is now: it finds the same, several times as fast."""

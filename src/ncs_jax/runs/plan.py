@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from ncs_jax.runs.placed_scene import PlacedScene
+from ncs_jax.runs.pose_stiffness import poses_of
 from ncs_jax.training.batches import CHUNK, whole_chunks
 from ncs_jax.training.step import TrainState
 
@@ -27,7 +28,7 @@ SLOW = 5.0  # s; a chunk that takes longer is timed once
 class Costs(NamedTuple):
     """What training takes, s: a step, a validation, a checkpoint with what goes with it; and after how many steps each is due.
 
-    A validation and a checkpoint are also due at the end.
+    A validation and a checkpoint are also due at the end. stiffness: of a pose, see `runs.pose_stiffness`.
     """
 
     step: float
@@ -36,13 +37,15 @@ class Costs(NamedTuple):
     lists: float
     validate_every: int
     checkpoint_every: int
+    stiffness: float = 0.0
 
     def seconds(self, first: int, last: int) -> float:
         """Return how long the steps first to last take."""
         validations = -(-last // self.validate_every) - first // self.validate_every
         checkpoints = -(-last // self.checkpoint_every) - first // self.checkpoint_every
         lists = sum(first < step <= last for step in EARLY) + last // self.checkpoint_every - first // self.checkpoint_every
-        rare = validations * self.validation + checkpoints * self.checkpoint + lists * self.lists
+        poses = poses_of(last) * (1 + (whole_chunks(last // 2) > first))
+        rare = validations * self.validation + checkpoints * self.checkpoint + lists * self.lists + poses * self.stiffness
         return MARGIN * ((last - first) * self.step + rare)
 
 
@@ -83,7 +86,8 @@ def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[],
         step = _seconds(chunk)
     validation = 0.0 if validate is None else _seconds(compiled(validate))
     every = whole_chunks(spec.validate_every), whole_chunks(spec.checkpoint_every)
-    return Costs(step / CHUNK, validation, checkpoint, relisted, *every)
+    pose = _seconds(compiled(lambda: placed.find_stiffness(state.params)))
+    return Costs(step / CHUNK, validation, checkpoint, relisted, *every, pose)
 
 
 def _seconds(work: Callable[[], object]) -> float:

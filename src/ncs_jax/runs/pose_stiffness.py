@@ -18,12 +18,17 @@ from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
 from ncs_jax.simulation.ritz_modes import displacement_slopes, stiffness_in_pose
 
-__all__ = ["learn_pose_stiffness"]
+__all__ = ["find_stiffness", "learn_pose_stiffness", "poses_of"]
 
 MOST = 128  # poses: by then the map explains 3 quarters of what differs between a skirt's
 FEWEST = 16  # poses that a map is fitted to
 STEPS = 64  # of training for each pose, so that they take about a twentieth of its time
 RIDGES = 10.0 ** np.arange(-4, 3)  # of the mean square of the descriptors
+
+
+def poses_of(steps: int) -> int:
+    """Return in how many poses a training of so many steps looks, twice."""
+    return min(MOST, steps // STEPS) if steps // STEPS >= FEWEST else 0
 
 
 def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures, steps: int, seed: int) -> Assembly:
@@ -35,16 +40,13 @@ def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures
     A network that does not swing, and a training too short for `FEWEST` poses, leave all as it is.
     """
     network, model = assembly.network, assembly.model
-    count = min(MOST, steps // STEPS, len(track.start))
+    count = min(poses_of(steps), len(track.start))
     if not isinstance(network, Swing) or count < FEWEST or required(model.vibrations, "vibrations").by_pose is None:
         return assembly
     frames = np.sort(np.random.default_rng([seed, 2]).permutation(len(track.start))[:count])
-    offsets = np.asarray(_static_offsets(network, params, model, track.static[frames]))
-    found = [stiffness_in_pose(model, track.matrices[t], jnp.asarray(offsets[..., i])) for i, t in enumerate(frames)]
     vibrations = required(model.vibrations, "model.vibrations")
-    by_pose = fitted(
-        np.asarray(track.static[frames], np.float64).reshape(count, -1), np.array(found) / float(vibrations.energy)
-    )
+    found = find_stiffness(network, params, model, track, frames) / float(vibrations.energy)
+    by_pose = fitted(np.asarray(track.static[frames], np.float64).reshape(count, -1), found)
     if by_pose is None:
         return assembly
     dtype = model.basis.dtype
@@ -52,6 +54,12 @@ def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures
     vibrations = replace(vibrations, by_pose=jnp.asarray(by_pose, dtype), slope=jnp.asarray(alone, dtype))
     slope = swing_range(network, params, replace(model, vibrations=vibrations), track)
     return with_vibrations(assembly, replace(vibrations, slope=jnp.asarray(slope, dtype)))
+
+
+def find_stiffness(network: Swing, params: dict, model: Model, track: MotionFeatures, frames: np.ndarray) -> np.ndarray:
+    """Return K (frames, modes, modes) of some frames about the network's static garment, J."""
+    offsets = np.asarray(_static_offsets(network, params, model, track.static[frames]))
+    return np.stack([stiffness_in_pose(model, track.matrices[t], jnp.asarray(offsets[..., i])) for i, t in enumerate(frames)])
 
 
 def with_vibrations(assembly: Assembly, vibrations: RitzModes) -> Assembly:
