@@ -221,3 +221,14 @@ def test_commands_keep_programs_in_a_folder_of_bounded_size(tmp_path, monkeypatc
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "ncs-jax" / "a"))  # a file: no folder can be made in it
     parser._keep_compiled_programs()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+def test_what_jaxlib_logs_without_consequence_is_hidden_before_jax_is_there(monkeypatch):
+    for found, level in (("0.10.1", "3"), ("0.11.0", None)):
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "")
+        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+        monkeypatch.setattr(parser, "version", lambda _, found=found: found)
+        parser.quieten_jaxlib()
+        assert os.environ.get("TF_CPP_MIN_LOG_LEVEL") == level
+    code = "import experiments, sys; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

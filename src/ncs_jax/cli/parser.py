@@ -15,7 +15,7 @@ from pathlib import Path
 from ncs_jax.cli import animate, body, check, evaluate, fit, preview, simulate, train, view
 from ncs_jax.errors import InputError, InputWarning
 
-__all__ = ["main"]
+__all__ = ["main", "quieten_jaxlib"]
 
 DESCRIPTION = """\
 Neural cloth simulation: a garment learns to move on an animated character from physics alone.
@@ -85,10 +85,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def quieten_jaxlib() -> None:
+    """Hide two errors of no consequence that some versions log for each program kept before; call it before JAX is imported."""
+    if version("jaxlib") in ("0.10.0", "0.10.1"):
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # JAX itself sets 1, which whoever started this process may have left
+
+
 def _keep_compiled_programs() -> None:
     """Have JAX keep compiled programs for the next run, once a command imports it; JAX's own variables win."""
-    if version("jaxlib") in ("0.10.0", "0.10.1"):  # which log two errors of no consequence for every program kept before
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # JAX itself sets 1, which whoever started this process may have left
+    quieten_jaxlib()
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
