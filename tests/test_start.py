@@ -113,7 +113,8 @@ def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path
 
     def found(model, track, count):
         draw = np.random.default_rng(0).normal(size=(len(model.basis), 3, count)) / 100
-        return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), jnp.eye(count, dtype=jnp.float32))
+        slope, drape = jnp.eye(count, dtype=jnp.float32), jnp.asarray(draw[:, :, 0], jnp.float32)
+        return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), slope, drape=drape)
 
     monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
     monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)

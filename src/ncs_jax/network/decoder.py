@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-__all__ = ["Decoder", "merge"]
+__all__ = ["Decoder", "begun_at", "merge"]
 
 
 @jax.custom_vjp
@@ -94,6 +94,12 @@ class Decoder(nn.Module):
             coefficients = self.coefficients(h).reshape(self.modes, -1)
             offsets = offsets + jnp.matmul(basis, coefficients, precision="highest").reshape(offsets.shape)
         return offsets.reshape(self.verts, 3, *code.shape[:-1])
+
+
+def begun_at(decoder: Decoder, params: dict, offsets: Float[Array, "verts 3"]) -> dict:
+    """Return parameters of a fresh decoder that gives such offsets, m, but for the little that chance adds."""
+    before = params["offsets"]
+    return {**params, "offsets": {**before, "bias": (offsets / decoder.local).reshape(-1).astype(before["bias"].dtype)}}
 
 
 def merge(decoder: Decoder, params: dict, basis: Float[Array, "verts modes"]) -> tuple[Decoder, dict]:

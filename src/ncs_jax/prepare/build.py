@@ -42,6 +42,7 @@ __all__ = [
     "training_motions",
 ]
 
+SWING = "vibrations", "energy", "slope", "by_pose", "drape"  # what `Prepared` keeps of a swing
 BEYOND = 1.5  # times as far as in training may a swing go
 LEAST = 0.01  # of the mean square of a training's swings, which every mode is taken to have at least
 LONG = 4096  # frames of which features are made at once, at most
@@ -212,17 +213,17 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
         modes = replace(modes, by_pose=as_about_the_drape(model, count))
         slope = _range(scene, replace(model, vibrations=modes), track)
         arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope, "by_pose": modes.by_pose}
-        return {name: np.asarray(array) for name, array in arrays.items()}
+        return {name: np.asarray(array) for name, array in (arrays | {"drape": modes.drape}).items()}
 
-    names = "vibrations", "energy", "slope", "by_pose"
-    return replace(prepared, **(kept(names, found, smooth, track, str(scene.network)) or {}))
+    return replace(prepared, **(kept(SWING, found, smooth, track, str(scene.network)) or {}))
 
 
 def _expected(setting: Setting, model: Model, track: MotionFeatures) -> Assembly:
     """Return what a scene becomes whose garment has all the vibrations that it may have: of zeros, as they are not known."""
     scene, basis = setting.scene, model.basis
     count, zeros = scene.network.vibrations, functools.partial(np.zeros, dtype=basis.dtype)
-    shapes = (len(basis), 3, count), (), (count, count), as_about_the_drape(setting.model, count).shape
+    by_pose = as_about_the_drape(setting.model, count).shape
+    shapes = (len(basis), 3, count), (), (count, count), by_pose, (len(basis), 3)
     modes = RitzModes(*(jax.device_put(zeros(shape)) for shape in shapes))
     setting = replace(setting, model=replace(model, vibrations=modes))
     return Assembly(**vars(setting), network=network_from(scene, setting.model), training_features=track)
@@ -256,8 +257,8 @@ def swing_range(network: Method, params: dict, model: Model, track: MotionFeatur
 
 def vibrations_of(prepared: Prepared, dtype) -> RitzModes:
     """Return what was prepared of a swing; without slope it is of a run of an earlier version."""
-    slope, by_pose = (jnp.asarray(a, dtype) if a.size else None for a in (prepared.slope, prepared.by_pose))
-    return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), slope, by_pose)
+    found = (jnp.asarray(a, dtype) if a.size else None for a in (prepared.slope, prepared.by_pose, prepared.drape))
+    return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), *found)
 
 
 def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeatures:

@@ -41,8 +41,9 @@ class Prepared:
     inputs: joints that the network reads, the root first. moves: whether the character ever moves. weights: the garment's
     skinning weights (verts, joints). part: numbers of the body vertices that the garment can touch. basis: its smooth modes
     (verts, modes), m. vibrations: the directions of a swing (verts, 3, modes), m. energy: of each of them, J. slope: how much
-    they turn and strain the garment (modes, modes), and by_pose: how stiff it is along them in a pose, see `RitzModes`. A scene
-    whose network does not swing has no vibrations. betas: the shape of an SMPL body.
+    they turn and strain the garment (modes, modes), by_pose: how stiff it is along them in a pose, and drape: how it hangs in
+    the first one (verts, 3), m, see `RitzModes`. A scene whose network does not swing has no vibrations. betas: the shape of an
+    SMPL body.
     """
 
     inputs: np.ndarray
@@ -54,6 +55,7 @@ class Prepared:
     energy: np.ndarray = field(default_factory=lambda: np.zeros(()))
     slope: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     by_pose: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    drape: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     betas: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 

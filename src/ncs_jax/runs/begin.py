@@ -15,7 +15,7 @@ import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
-from ncs_jax.prepare.build import Assembly, vibrations_of
+from ncs_jax.prepare.build import SWING, Assembly, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
@@ -185,8 +185,7 @@ def _with_fields_of(before: Prepared, assembly: Assembly) -> Assembly:
     model, prepared = assembly.model, replace(assembly.prepared, basis=before.basis)
     model = replace(model, basis=jnp.asarray(before.basis, model.basis.dtype))
     if model.vibrations is not None:
-        found = {name: getattr(before, name) for name in ("vibrations", "energy", "slope", "by_pose")}
-        prepared = replace(prepared, **found)
+        prepared = replace(prepared, **{name: getattr(before, name) for name in SWING})
         model = replace(model, vibrations=vibrations_of(prepared, model.basis.dtype))
     return replace(assembly, model=model, prepared=prepared)
 

@@ -13,7 +13,7 @@ from ncs_jax.errors import required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.numerics import normalize
-from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.geometry.skinning import blend, skin, unpose
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
 from ncs_jax.scene.step_inputs import Past, step_inputs
@@ -112,7 +112,7 @@ def _solved(matrix, right):
 
 
 def _drape(problem: Problem, x, mass):
-    """The stiffness K (3 verts, 3 verts) about the static equilibrium x_0 near x; None where the garment comes to no rest.
+    """The static equilibrium x_0 near x, and the stiffness K (3 verts, 3 verts) there; None where it comes to no rest.
 
     Without friction or pins a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium
     near, and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as
@@ -132,7 +132,7 @@ def _drape(problem: Problem, x, mass):
         p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
         step = np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum())
         if count > FALL and step < STILL[x.dtype]:
-            return stiff
+            return x, stiff
         p = jnp.asarray(p, x.dtype)
         longest = t = float(_longest(point, p))
         while not _accepted(point, (known := _evaluated(problem, x + t * p, held, at))[1], t, p):
@@ -140,7 +140,7 @@ def _drape(problem: Problem, x, mass):
             if t < LEAST_STEP:
                 break
         if t < LEAST_STEP:  # as near as rounding lets it come, or lost
-            return stiff if count > FALL and step < 10 * STILL[x.dtype] else None
+            return (x, stiff) if count > FALL and step < 10 * STILL[x.dtype] else None
         x = x + t * p
         if count >= FALL:
             h = min(2 * h, 1 / (2 * np.pi * LEAST)) if t > 0.5 else h if t > 0.25 * longest else max(h / 2, least)
@@ -179,9 +179,10 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
-    stiff = _drape(problem, skin(transforms, mesh.rest), mass)
-    if stiff is None:
+    drape = _drape(problem, worn := skin(transforms, mesh.rest), mass)
+    if drape is None:
         return None
+    x, stiff = drape
     u = _solved(stiff + least * masses, masses @ np.kron(smooth, np.eye(3)))
     squares, combined = eigh(u.T @ (stiff @ u), u.T @ (masses @ u))
     if squares[0] < least:
@@ -193,7 +194,8 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
         np.asarray(transforms, np.float64)[..., :3], (vectors * np.sqrt(energy / squares)).reshape(n, 3, -1)
     )
     slopes = displacement_slopes(mesh, directions)
-    return RitzModes(*(jnp.asarray(array, model.basis.dtype) for array in (directions, energy, slopes)))
+    found = (jnp.asarray(array, model.basis.dtype) for array in (directions, energy, slopes))
+    return RitzModes(*found, drape=unpose(transforms, x) - unpose(transforms, worn))  # zeros where a blend is singular
 
 
 def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarray:

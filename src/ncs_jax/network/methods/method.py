@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from ncs_jax.energies.terms import Terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import Blend
-from ncs_jax.network.decoder import Decoder, merge
+from ncs_jax.network.decoder import Decoder, begun_at, merge
 from ncs_jax.scene.descriptors import DESCRIPTORS
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
@@ -208,11 +208,18 @@ def check_network(network: Any, model: Model) -> None:
 
 
 def initial_parameters(network: Method, key: Array, model: Model) -> dict:
-    """Return fresh parameters: a plain pytree of arrays."""
+    """Return fresh parameters, a plain pytree of arrays.
+
+    Where the garment's drape is known, it begins there: its folds fall as a simulation's do. A training that begins at rest has
+    others, as folds may fall in many ways for the same energy, or has none for long, as they cost so little.
+    """
     first, second, third = jax.random.split(key, 3)
     code = jnp.zeros(network.code_size(model), model.basis.dtype)
     params = network.init((first, second), model)
     params["decoder"] = network.decoder.init(third, code, model.basis)["params"]
+    drape = None if model.vibrations is None else model.vibrations.drape
+    if drape is not None and isinstance(network.decoder, Decoder):
+        params["decoder"] = begun_at(network.decoder, params["decoder"], drape)
     if network.learn_weights:
         params["blend"] = jnp.zeros_like(model.blend.weights)
     return params
