@@ -317,25 +317,25 @@ def test_the_simulator_pushes_out_what_sinks_between_vertices(tmp_path):
     assert depths["0"] > 0.004 and depths["auto"] < 0.001
 
 
+@jax.jit
+def descended(model, matrices):
+    """The garment after descent of the loss itself, by the offsets that a network would give."""
+
+    def step(offsets, _):
+        _, slope, _ = physics(model, model.blend, [offsets], matrices, jnp.ones(1))
+        return offsets - 5e-4 * slope, None
+
+    offsets, _ = jax.lax.scan(step, jnp.zeros((*model.garment.mesh.rest.shape, 1)), None, length=400)
+    return model.garment.mesh.rest + offsets[..., 0]
+
+
 def test_training_pushes_it_out_too(tmp_path):
-    """Descent of the loss itself, by the offsets that a network would give."""
     depths = {}
     for points in ("0", "auto"):
         assembly = scene(tmp_path, points, "plane")
         model, track = assembly.model, assembly.track
         model = replace(model, terms=replace(model.terms, inertia=False, gravity=False))
-        matrices = track.matrices[:1][..., None]
-
-        @jax.jit
-        def descended(model, matrices):
-            def step(offsets, _):
-                _, slope, _ = physics(model, model.blend, [offsets], matrices, jnp.ones(1))
-                return offsets - 5e-4 * slope, None
-
-            return jax.lax.scan(step, jnp.zeros((*model.garment.mesh.rest.shape, 1)), None, length=400)[0]
-
-        offsets = descended(model, matrices)
-        x = np.asarray(model.garment.mesh.rest + offsets[..., 0])
+        x = descended(model, track.matrices[:1][..., None])
         depths[points] = deepest(model, x, pose_body(model, track.matrices[0]))
     assert depths["0"] > 0.004 and depths["auto"] < 0.001
 
