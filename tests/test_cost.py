@@ -19,7 +19,7 @@ import pytest
 from benchmarks.cost import COUNTS, counted
 
 from .conftest import AS_USERS, PLAIN_CODE
-from .scenes import SCENE, write_scene
+from .scenes import write_scene
 
 RECORD = Path(__file__).parent / "cost.json"
 KEY = f"jax {jax.__version__}, {jax.default_backend()}, {platform.machine()}"
@@ -27,13 +27,9 @@ TOLERANCE = 0.03
 
 
 def measured(folder, *options):
-    """The counts of the scene of the tests, from a process of its own: programs as a user has them, and a time limit.
-
-    Its contact is that of a garment fine enough to need no points between its vertices: what is off costs nothing.
-    """
+    """The counts of the scene of the tests, from a process of its own: programs as a user has them, and a time limit."""
     out = folder / "cost.json"
-    scene = write_scene(folder, SCENE + "[physics.collision]\npoints = 0\n")
-    command = [sys.executable, "-m", "benchmarks.cost", str(scene), "--json", str(out), *options]
+    command = [sys.executable, "-m", "benchmarks.cost", str(write_scene(folder)), "--json", str(out), *options]
     environment = {**AS_USERS, "XLA_FLAGS": f"{PLAIN_CODE} {AS_USERS['XLA_FLAGS']}"}
     subprocess.run(command, check=True, timeout=300, cwd=RECORD.parents[1], env=environment, stdout=subprocess.DEVNULL)
     return json.loads(out.read_text())["rows"]

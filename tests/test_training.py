@@ -30,7 +30,7 @@ runner = cache(chunk_runner)
 
 def test_single_precision_energies_agree_with_a_plain_double_precision_reference(rng):
     """The batched path in float32 against every term of one pose after the other in float64, with every pair searched."""
-    assembly, _, ends, _ = prepared()
+    assembly, _, ends, _ = prepared({"physics.collision.points": "auto"})
     model, track, poses = assembly.model, assembly.track, np.asarray(ends[0])
     back = np.maximum(poses[None] - np.arange(3)[:, None], 0)
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)

@@ -13,13 +13,11 @@ from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
-from ncs_jax.prepare.contact_detail import pieces_of
 from ncs_jax.prepare.covering import Cover, contact_for, sinking
 from ncs_jax.prepare.garment_checks import FAR
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.skinning_weights import transfer_weights
-from ncs_jax.scene.spec import CollisionSpec
 
 __all__ = ["PINS", "Fitted", "fit", "lying_on", "pins_of", "push_out", "settle", "spread", "spread_weights"]
 
@@ -70,9 +68,7 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
     placement.check(file)
     placed = placement.garment
     before = placed.vertices.astype(np.float64)
-    usual = CollisionSpec().thickness if clearance is None else clearance
-    pieces = pieces_of(before, placed.faces, [body.vertices], body.faces, usual)
-    contact = contact_for(before, placed.faces, sinking(before, placed.faces, body.vertices, body.faces, pieces), clearance)
+    contact = contact_for(before, placed.faces, sinking(before, placed.faces, body.vertices, body.faces), clearance)
     x = push_out(before, placed.faces, body, contact.thickness)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
