@@ -28,6 +28,7 @@ from jax import lax
 from benchmarks import work
 from benchmarks.measure import ROUNDS, advanced, clocks, looped, nudged, peak_memory, read, run, timed
 from ncs_jax import assemble, local_rotations
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.elements import elastic
 from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import contact_force, distances, energy_terms
@@ -164,7 +165,7 @@ def parts(assembly: Assembly, state: TrainState, ends, pairs) -> dict[str, tuple
     def queried(varied, model):
         def one(varied):
             x, body = varied
-            return distances(x, body["body"], model.surface, terms, body.get("normals"))
+            return distances(with_points(x, model.surface.points), body["body"], model.surface, terms, body.get("normals"))
 
         return one(varied) if terms.collision == "plane" else lax.map(one, _front(varied))
 

@@ -466,7 +466,7 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     np.testing.assert_allclose(quick["strain_mean"], rows["strain_mean"][::every].mean(), rtol=1e-3)
     np.testing.assert_allclose(quick["penetrating"], rows["penetrating"][::every].mean(), atol=1e-6)
     np.testing.assert_allclose(quick["depth_max"], rows["depth_max"][::every].max(), atol=1e-2)
-    deepest = np.maximum(rows["depth_max"], rows["middle_depth_max"])[::every]
+    deepest = np.max([rows[f"{part}depth_max"] for part in ("", "middle_", "centre_")], axis=0)[::every]
     bare, worst = int((deepest > 1).sum()), every * int(deepest.argmax())
     assert bare > 0 and (quick["bare"], quick["barest"], quick["measured"]) == (bare, worst, len(deepest))
     shows = f"skin shows by 1 mm in {bare} of {len(deepest)} frames that were measured"

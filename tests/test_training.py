@@ -30,7 +30,7 @@ runner = cache(chunk_runner)
 
 def test_single_precision_energies_agree_with_a_plain_double_precision_reference(rng):
     """The batched path in float32 against every term of one pose after the other in float64, with every pair searched."""
-    assembly, _, ends, _ = prepared()
+    assembly, _, ends, _ = prepared({"physics.collision.points": "auto"})
     model, track, poses = assembly.model, assembly.track, np.asarray(ends[0])
     back = np.maximum(poses[None] - np.arange(3)[:, None], 0)
     matrices = jnp.moveaxis(track.matrices[back], 1, -1)
@@ -55,11 +55,13 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
     for i in range(len(poses)):
         at = ([np.float64(table)[..., i] for table in group] for group in (matrices, offsets))
         expected, x, body, normals = jax.device_get(one(exact, *at))
+        points = exact.surface.points
+        x = np.concatenate([x, np.einsum("pk,pki->pi", points.weights, x[np.asarray(points.corners)])])
         apart = x[:, None] - body[None]
         nearest = np.argmin(np.linalg.norm(apart, axis=-1), axis=1)
         distance = np.sum(normals[nearest] * apart[np.arange(len(x)), nearest], axis=-1)
         short = np.minimum(distance - float(exact.material.thickness), 0)
-        expected["collision"] = float(exact.material.collision) * np.sum(short**2)
+        expected["collision"] = float(exact.material.collision) * np.sum(points.shares * short**2)
         assert expected.keys() == fast.keys() and expected["collision"] > 0
         for name, value in expected.items():
             np.testing.assert_allclose(fast[name][i], value, rtol=1e-5, err_msg=name)

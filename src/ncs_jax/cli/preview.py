@@ -54,7 +54,7 @@ def _say_bare(quantities: dict[str, float], thickness: float) -> None:
     """Print in how many frames skin is outside the cloth, where it is worst, and what mends it."""
     if "bare" not in quantities:
         return
-    deepest = max(quantities["depth_max"], quantities["middle_depth_max"])
+    deepest = max(quantities[f"{part}depth_max"] for part in ("", "middle_", "centre_"))
     frames = f"{quantities['bare']:.0f} of {quantities['measured']:.0f} frames that were measured"
     worst = f"{deepest:.1f} mm outside the cloth in frame {quantities['barest']:.0f}"
     print(f"  skin shows by 1 mm in {frames}, at most {worst}: train longer")

@@ -51,7 +51,8 @@ NAMES = (
 # What a log and an evaluation write beside the energies: a term of this name would be lost among them.
 MEASURED = (
     *("step", "strain", "moved", "dropped", "seconds"),
-    *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max", "middle_depth_max"),
+    *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max"),
+    *("middle_penetrating", "middle_depth_max", "centre_penetrating", "centre_depth_max"),
     *("within_1mm", "self_intersecting", "out_of_balance", "gradient_norm", "outside", "speed", "lag", "settling", "overshoot"),
     *("gain", "dynamic_share", "stopped_share", "hem_correlation", "distance"),
     *("static_distance", "dynamic_correlation", "dynamic_factor"),

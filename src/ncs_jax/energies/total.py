@@ -14,6 +14,7 @@ from ncs_jax.energies.contact.distance import nearest_distance, plane_distance
 from ncs_jax.energies.contact.friction import friction
 from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.pairs import nearby_pairs
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.self_contact import self_contact
 from ncs_jax.energies.contact.smooth import blended_contact, nearby_quadrics
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
@@ -29,15 +30,16 @@ __all__ = ["body_collision", "contact_force", "distances", "energy_terms", "tota
 
 
 def distances(
-    x: Float[Array, "verts 3 *poses"],
+    x: Float[Array, "points 3 *poses"],
     body: Float[Array, "body 3 *poses"],
     surface: Surface,
     terms: Terms,
     normals: Float[Array, "body 3 *poses"] | None = None,
-) -> Float[Array, "verts *poses"]:
+) -> Float[Array, "points *poses"]:
     """Return the signed distance to the posed body in m by the scene's query; of several poses at once by "plane" alone.
 
-    `normals`: of the body's vertices, where they are known; "plane" works them out otherwise.
+    `x`: all that the surface groups, `points.with_points` of the vertices. `normals`: of the body's vertices, where they are
+    known; "plane" works them out otherwise.
     """
     if terms.collision == "triangle":
         return nearest_distance(x, body, surface, exact=terms.exact)
@@ -48,11 +50,14 @@ def distances(
 
 
 def body_collision(x, body, surface: Surface, terms: Terms, material: Material, normals=None) -> Float[Array, "*poses"]:
-    """Return the energy of collision with the body (12) in J, by the scene's query; arguments as of `distances`."""
+    """Return the energy of collision with the body (12) in J, by the scene's query; x (verts, 3, *poses), m."""
+    points = surface.points
+    x, shares = with_points(x, points), None if points is None else points.shares
     if terms.collision == "smooth":
         near = nearby_quadrics(x, body, surface)
-        return material.collision * jnp.sum(blended_contact(x, near, surface, material.thickness).shortfall)
-    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision)
+        lost = blended_contact(x, near, surface, material.thickness).shortfall
+        return material.collision * jnp.sum(lost if shares is None else shares.astype(lost.dtype) * lost)
+    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision, shares)
 
 
 def contact_force(

@@ -311,7 +311,7 @@ def adjacency(edges: np.ndarray, verts: int):
     return coo_array((np.ones(len(i)), (i, j)), shape=(verts, verts)).tocsr()
 
 
-def with_middles(x, edges):
-    """Return vertices (verts, 3) followed by the middles of edges (edges, 2), m: of arrays of NumPy or of JAX."""
+def with_middles(x, *elements):
+    """Return vertices (verts, 3), then the middles of edges (edges, 2), of faces, m: of arrays of NumPy or of JAX."""
     numbers = jnp if isinstance(x, jax.Array) else np
-    return numbers.concatenate([x, x[edges].mean(axis=1)])
+    return numbers.concatenate([x, *(x[corners].mean(axis=1) for corners in elements)])

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ncs_jax.energies.bending import angles
 from ncs_jax.energies.contact.intersections import intersecting
 from ncs_jax.energies.contact.pairs import Groups, groups_from
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.gravity import gravity
@@ -34,7 +35,7 @@ from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.scene.step_inputs import Past, step_inputs
 
-__all__ = ["QUANTITIES", "measure", "measure_on_host", "summarise"]
+__all__ = ["PARTS", "QUANTITIES", "measure", "measure_on_host", "summarise"]
 
 # name: unit and what it is
 QUANTITIES = {
@@ -45,7 +46,10 @@ QUANTITIES = {
     "penetrating": ("%", "vertices inside the body, by exact point-triangle distance"),
     "within_1mm": ("%", "vertices inside the body or nearer to it than 1 mm"),
     "depth_max": ("mm", "deepest penetration"),
+    "middle_penetrating": ("%", "edges whose middle is inside the body"),
     "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
+    "centre_penetrating": ("%", "triangles whose centre is inside the body"),
+    "centre_depth_max": ("mm", "deepest penetration of a triangle's centre"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
     "outside": ("%", "frames beyond the poses and speeds that the network was trained on"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
@@ -53,6 +57,7 @@ QUANTITIES = {
 }
 
 INSIDE = {"penetrating": 0.0, "within_1mm": -0.001}  # m of depth from which on a vertex counts
+PARTS = ("", "middle_", "centre_")  # of a garment that may be inside: vertices, edges, triangles
 
 
 class _Frames(NamedTuple):
@@ -111,22 +116,25 @@ def _energies_and_shape(model: Model, frames: _Frames) -> dict[str, Float[Array,
 def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
     """Measure how much of a garment is inside the body.
 
-    surface: the body as vertices and middles of edges look for it, by exact distance; None: by the scene's own query.
+    surface: the body as vertices and middles of edges and triangles look for it, by exact distance; None: by the scene's own
+    query, of vertices.
     """
-    verts = len(model.garment.mesh.rest)
+    mesh = model.garment.mesh
+    verts, sides = len(mesh.rest), len(mesh.edges)
 
     def one(frame):
         x, body = frame.x, pose_body(model, frame.matrices)
         if surface is None:
-            depth = -distances(x, body, required(model.surface, "model.surface"), model.terms)
+            own = required(model.surface, "model.surface")
+            depth = -distances(with_points(x, own.points), body, own, model.terms)[:verts]
         else:
-            depth = depths_in(with_middles(x, model.garment.mesh.edges), body, surface, bool(model.under))
-        parts = {"depth_max": depth[:verts]}
-        if surface is not None:
-            parts["middle_depth_max"] = depth[verts:]
-        deepest = {name: 1000 * jnp.maximum(jnp.max(part), 0) for name, part in parts.items()}
-        shares = {name: 100 * jnp.mean(depth[:verts] > least) for name, least in INSIDE.items()}
-        return {**shares, **deepest}
+            depth = depths_in(with_middles(x, mesh.edges, mesh.faces), body, surface, bool(model.under))
+        found = {name: 100 * jnp.mean(depth[:verts] > least) for name, least in INSIDE.items()}
+        for name, part in zip(PARTS, (depth[:verts], depth[verts:][:sides], depth[verts:][sides:]), strict=True):
+            if part.size:
+                found[f"{name}penetrating"] = 100 * jnp.mean(part > 0)
+                found[f"{name}depth_max"] = 1000 * jnp.maximum(jnp.max(part), 0)
+        return found
 
     return lax.map(one, frames.seen_from_root()[0])
 
@@ -143,14 +151,15 @@ def _intersections(mesh: Mesh, groups: Groups, frames: _Frames) -> dict[str, Flo
 
 
 def _surface_of_all(model: Model) -> Surface:
-    """Return the body as vertices and middles of edges look for it."""
+    """Return the body as vertices and middles of edges and triangles look for it."""
+    mesh = model.garment.mesh
     body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
     faces = np.asarray(required(model.surface, "model.surface").faces)
-    return surface_from(np.asarray(with_middles(model.garment.mesh.rest, model.garment.mesh.edges)), body, faces)
+    return surface_from(np.asarray(with_middles(mesh.rest, mesh.edges, mesh.faces)), body, faces)
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {
-    "depth_max": np.max, "middle_depth_max": np.max, "out_of_balance": np.median,
+    **{f"{name}depth_max": np.max for name in PARTS}, "out_of_balance": np.median,
 }  # fmt: skip
 
 BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
@@ -169,8 +178,8 @@ def measure(
     Args:
         vertices: (frames, verts, 3) in m, from a network, a simulation or a file: of the motion's first frames, or of all.
         track: the motion it belongs to.
-        exact: penetration by the exact signed distance to the body's triangles, also of the middles of the edges; else by the
-            scene's own query, which is faster.
+        exact: penetration by the exact signed distance to the body's triangles, also of the middles of edges and triangles;
+            else by the scene's own query, which is faster.
         self_contact: whether to look for triangles that pass through each other; None: where the scene has self-contact.
 
     Energies use the scene's own terms; heights are measured from the track's origin. Before its first frame the garment is
@@ -220,22 +229,23 @@ def measure_on_host(
 
     Args:
         vertices: (frames, verts, 3), m, such as a few frames of a motion. skin: what the garment may touch, as
-            `model.surface` numbers it, in these frames (frames, body, 3), m. middles: also look at the middles of the edges.
+            `model.surface` numbers it, in these frames (frames, body, 3), m. middles: of edges and triangles too.
     """
     mesh = model.garment.mesh
-    edges, rest = np.asarray(mesh.edges), np.asarray(mesh.edge_length, np.float64)
+    edges, faces, rest = np.asarray(mesh.edges), np.asarray(mesh.faces), np.asarray(mesh.edge_length, np.float64)
     x = np.asarray(vertices, np.float64)
     lengths = np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2)
     rows = {"strain_mean": 100 * np.abs(lengths / np.where(rest > 0, rest, 1) - 1).mean(axis=1)}
     if skin is None or model.surface is None:
         return rows
-    points = np.stack([with_middles(frame, edges) for frame in x]) if middles else x
+    points = np.stack([with_middles(frame, edges, faces) for frame in x]) if middles else x
     depths = depths_on_host(points, skin, np.asarray(model.surface.faces), layered=bool(model.under))
     own = x.shape[1]
     rows |= {name: 100 * (depths[:, :own] > least).mean(axis=1) for name, least in INSIDE.items()}
-    for name, part in (("depth_max", depths[:, :own]), ("middle_depth_max", depths[:, own:])):
+    for name, part in zip(PARTS, np.split(depths, (own, own + len(edges)), axis=1), strict=True):
         if part.size:
-            rows[name] = 1000 * np.maximum(part.max(axis=1), 0)
+            rows[f"{name}penetrating"] = 100 * (part > 0).mean(axis=1)
+            rows[f"{name}depth_max"] = 1000 * np.maximum(part.max(axis=1), 0)
     return rows
 
 

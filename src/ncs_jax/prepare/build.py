@@ -138,7 +138,8 @@ def build(
     prepared = setting.prepared
     if model.body is not None and body is not None:
         faces = touchable_faces(model, body, prepared.part)
-        model = replace(model, surface=surface_of(model, faces, track, scene.physics.collision.distance == "smooth"))
+        smooth = scene.physics.collision.distance == "smooth"
+        model = replace(model, surface=surface_of(model, faces, track, smooth=smooth, pieces=prepared.pieces))
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
@@ -203,7 +204,8 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
 
     smooth, count = model, scene.network.vibrations
     if faces is not None:
-        smooth = replace(model, terms=replace(model.terms, collision="smooth"), surface=surface_of(model, faces, track, True))
+        surface = surface_of(model, faces, track, smooth=True, pieces=prepared.pieces)
+        smooth = replace(model, terms=replace(model.terms, collision="smooth"), surface=surface)
 
     def found() -> dict[str, np.ndarray] | None:
         begin()

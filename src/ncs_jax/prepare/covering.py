@@ -43,16 +43,19 @@ class Cover:
         return self.sinking + self.pressed
 
 
-def sinking(x: np.ndarray, faces: np.ndarray, skin: np.ndarray, skin_faces: np.ndarray) -> float:
-    """Return how deep the triangles of a garment lie in the skin when their corners are on it, m; zero where none is near.
+def sinking(
+    x: np.ndarray, faces: np.ndarray, skin: np.ndarray, skin_faces: np.ndarray, pieces: np.ndarray | None = None
+) -> float:
+    """Return how deep the triangles of a garment lie in the skin when what touches is on it, m; zero where none is near.
 
-        s = the 99th percentile, over the triangles, of  max_p depth(sum_k p_k c(x_k)),   c(x): the closest point of the skin
+        s = the 99th percentile, over the triangles, of  max_p depth(sum_k p_k c(x_k)) / n^2,   c(x): the skin's closest point
 
     A flat triangle with edges l over a ball of radius R sinks by about l^2 / (6 R) in its middle and l^2 / (8 R) in those of
     its edges. Here the body's own mesh is asked, so that its facets and corners count as well.
 
     Args:
         x: (V, 3), faces (F, 3): the garment on the body, m. skin (B, 3), skin_faces: the body's, m.
+        pieces: n, into how many contact cuts the edges of each triangle (F,); None, or empty: it looks at the corners alone.
     """
     x, every = np.asarray(x, np.float64), np.linspace(0, len(faces) - 1, min(SAMPLED, len(faces))).astype(int)
     corners = x[faces[every]]
@@ -61,13 +64,14 @@ def sinking(x: np.ndarray, faces: np.ndarray, skin: np.ndarray, skin_faces: np.n
     on_skin = corners - gap
     near = (np.linalg.norm(gap, axis=-1) < NEAR).all(axis=1)
     whole = (_edges(on_skin) <= STRETCH * _edges(corners)).all(axis=1)
-    kept = on_skin[near & whole]
+    pieces = np.ones(len(faces)) if pieces is None or not pieces.size else pieces
+    kept, cut = on_skin[near & whole], pieces[every[near & whole]]
     if not len(kept):
         return 0.0
     points = np.einsum("pk,fki->fpi", PLACES / PLACES.sum(axis=1, keepdims=True), kept)
     border = border_of(skin_faces, len(skin))
     depth = -signed_distance(points.reshape(-1, 3), skin, skin_faces, border).reshape(points.shape[:2])
-    return float(max(np.percentile(depth.max(axis=1), QUANTILE), 0))
+    return float(max(np.percentile(depth.max(axis=1) / cut.astype(float) ** 2, QUANTILE), 0))
 
 
 def _edges(corners: np.ndarray) -> np.ndarray:

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ncs_jax import io
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
+from ncs_jax.prepare.contact_detail import bent_most, pieces_of, posed_skins
 from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import covered_by_layers, touchable_part
+from ncs_jax.prepare.touchable import covered_by_layers, submesh, touchable_part
 from ncs_jax.scene.model import Layer
 from ncs_jax.scene.spec import Scene
 
@@ -43,7 +44,8 @@ class Prepared:
     (verts, modes), m. vibrations: the directions of a swing (verts, 3, modes), m. energy: of each of them, J. slope: how much
     they turn and strain the garment (modes, modes), by_pose: how stiff it is along them in a pose, and drape: how it hangs in
     the first one (verts, 3), m, see `RitzModes`. A scene whose network does not swing has no vibrations. betas: the shape of an
-    SMPL body.
+    SMPL body. pieces: into how many contact cuts the edges of each triangle (faces,), see `contact_detail.pieces_of`; none
+    where all are whole.
     """
 
     inputs: np.ndarray
@@ -57,6 +59,7 @@ class Prepared:
     by_pose: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     drape: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     betas: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    pieces: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
 
 
 def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prepared:
@@ -81,7 +84,21 @@ def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prep
         turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in motions], axis=0)
         wanted = tuple(j for j in wanted if turning[j] or body.parents[j] < 0)
     inputs = _input_joints(scene, body, wanted)
-    return Prepared(np.asarray(inputs), np.asarray(moves), weights.astype(np.float32), part, basis)
+    pieces = _pieces(files, part, motions) if len(part) else np.zeros(0, np.int8)
+    return Prepared(np.asarray(inputs), np.asarray(moves), weights.astype(np.float32), part, basis, pieces=pieces)
+
+
+def _pieces(files: SceneFiles, part: np.ndarray, motions: Sequence[io.MotionRecord]) -> np.ndarray:
+    """Return into how many pieces contact cuts the edges of each triangle (faces,), none where all are whole."""
+    collision, body, garment = files.scene.physics.collision, required(files.body, "body"), files.garment
+    if collision.points != "auto":
+        pieces = np.full(len(garment.faces), 1 + int(collision.points), np.int8)
+    else:
+        poses = [bent_most(record.poses) for record in motions]
+        bent = bent_most(np.concatenate(poses)) if poses else np.zeros((0, len(body.parents), 3))
+        faces = submesh(body.faces, part, len(body.vertices))
+        pieces = pieces_of(garment.vertices, garment.faces, posed_skins(body, part, bent), faces, collision.thickness)
+    return pieces if (pieces > 1).any() else pieces[:0]
 
 
 def _smooth_modes(files: SceneFiles) -> np.ndarray:

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.energies.contact.points import contact_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
 from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
@@ -14,7 +15,7 @@ from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
 
-__all__ = ["covered_by_layers", "enclosure", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = ["covered_by_layers", "enclosure", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
 
 def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, poses: np.ndarray, reach: float) -> np.ndarray:
@@ -65,7 +66,7 @@ def touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.n
     """Return the triangles of the touchable part of the body and of the garments below, all facing outward."""
     from scipy.spatial import cKDTree
 
-    faces, count = [_submesh(body.faces, part, len(body.vertices))], len(part)
+    faces, count = [submesh(body.faces, part, len(body.vertices))], len(part)
     for layer in model.under:
         own, rest = np.asarray(layer.model.garment.mesh.faces), np.asarray(layer.rest)
         _, near = cKDTree(body.vertices).query(rest)
@@ -94,14 +95,21 @@ def covered_by_layers(body: io.BodyRecord, under: tuple[Layer, ...]) -> np.ndarr
     return hidden
 
 
-def surface_of(model: Model, faces, track: MotionFeatures | None, smooth: bool, samples: int = 8) -> Surface:
-    """Return the touchable body as a surface, with its search prepared for what comes near in some poses of the motion."""
+def surface_of(
+    model: Model, faces, track: MotionFeatures | None, *, smooth: bool, pieces: np.ndarray, samples: int = 8
+) -> Surface:
+    """Return the touchable body as a surface, with its search prepared for what comes near in some poses of the motion.
+
+    pieces: into how many contact cuts the edges of each triangle, none where all are whole, see `contact_detail`.
+    """
     poses = []
     if track is not None:
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
         poses = list(zip(*map(np.asarray, _worn(model, track.matrices[frames])), strict=True))
     rest, body = np.asarray(model.garment.mesh.rest), np.concatenate([model.body, *(layer.rest for layer in model.under)])
-    return surface_from(rest, body, faces, smooth=smooth, posed=poses)
+    mesh = model.garment.mesh
+    points = contact_points(np.asarray(mesh.faces), np.asarray(mesh.face_area), pieces, len(rest)) if pieces.size else None
+    return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)
 
 
 @jax.jit
@@ -130,7 +138,7 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     return np.unique(body.faces[near[body.faces].any(axis=1)])
 
 
-def _submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:
+def submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:
     """Return the triangles of the kept vertices, which are numbered anew."""
     number = np.full(verts, -1)
     number[kept] = np.arange(len(kept))

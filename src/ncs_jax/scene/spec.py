@@ -149,6 +149,7 @@ class CollisionSpec:
     thickness: float = _f(0.004, "distance to keep from the body, m", low=0, high=0.1)
     distance: str = _f("plane", "signed distance to the body", choices=("plane", "smooth", "triangle"))
     search: str = _f("exact", "search for the nearest feature", choices=("exact", "candidates"))
+    points: str = _f("0", "points inside an edge that touch too; auto: as the body's curves ask", choices=("auto", *"0123"))
     friction: float = _f(0.0, "coefficient of friction between garment and body; 0: none", low=0, high=10)
     reach: float = _f(0.08, "the body can be touched within this distance of the skinned garment, m", low=0.005, high=10)
 
@@ -393,13 +394,8 @@ def _parse(cls, tables, source: str, where: str):
     for key in tables:
         if key not in fields:
             near = next(iter(difflib.get_close_matches(key, list(fields), n=1)), "")
-            raise InputError(
-                "unknown key",
-                file=source,
-                field=f"{where}.{key}".lstrip("."),
-                value=tables[key],
-                mend=f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}",
-            )
+            mend = f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}"
+            raise InputError("unknown key", file=source, field=f"{where}.{key}".lstrip("."), value=tables[key], mend=mend)
     values = {}
     for name, f in fields.items():
         if name in tables:

@@ -77,14 +77,14 @@ class Simulation(NamedTuple):
 
 def simulator_from(model: Model) -> Simulator:
     """Precompute a model's couplings and order of elimination."""
-    couplings = couplings_from(model.garment.mesh)
+    couplings = couplings_from(model.garment.mesh, None if model.surface is None else model.surface.points)
     return Simulator(model, couplings, elimination(np.asarray(couplings.pairs), np.asarray(model.garment.mesh.rest)))
 
 
 def _expected(problem: Problem, state: SimulationState, advected, transforms) -> Float[Array, "verts 3"]:
     """Return where a frame's search starts: the last frame goes on as in unposed space, but through no limb, however fast."""
     onward = skin(transforms, 2 * state.unposed - state.unposed_before) - advected
-    start = advected + jnp.atleast_1d(share_outside_body(body_contact(problem, advected), onward))[:, None] * onward
+    start = advected + jnp.atleast_1d(share_outside_body(problem, body_contact(problem, advected), onward))[:, None] * onward
     return lax.stop_gradient(hold_pins(problem, start))
 
 

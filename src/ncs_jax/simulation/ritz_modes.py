@@ -48,7 +48,8 @@ def _still(model: Model, matrices: Array) -> tuple[Problem, Array]:
     model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
     transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
     step = step_inputs(model, matrices, Past(rest, rest, moving=jnp.zeros((), rest.dtype)), transforms=transforms)
-    return Problem(model, couplings_from(model.garment.mesh), None, step), transforms
+    points = None if model.surface is None else model.surface.points
+    return Problem(model, couplings_from(model.garment.mesh, points), None, step), transforms
 
 
 @jax.jit
@@ -77,8 +78,8 @@ def _sticking(problem: Problem, point):
 
 
 @jax.jit
-def _longest(point, p):
-    return jnp.min(share_outside_body(point.contact, p))
+def _longest(problem: Problem, point, p):
+    return jnp.min(share_outside_body(problem, point.contact, p))
 
 
 _accepted = jax.jit(accepts)
@@ -127,14 +128,14 @@ def _drape(problem: Problem, x, mass):
         if count == FALL:
             held, at = _sticking(problem, known[1]), x
             known = _evaluated(problem, x, held, at)
-        _, point, found = known
+        here, point, found = known
         stiff = _stiff(problem, found, mass)
         p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
         step = np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum())
         if count > FALL and step < STILL[x.dtype]:
             return x, stiff
         p = jnp.asarray(p, x.dtype)
-        longest = t = float(_longest(point, p))
+        longest = t = float(_longest(here, point, p))
         while not _accepted(point, (known := _evaluated(problem, x + t * p, held, at))[1], t, p):
             t /= 2
             if t < LEAST_STEP:

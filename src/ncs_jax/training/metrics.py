@@ -10,7 +10,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.total import distances
+from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import edge_strain
 from ncs_jax.geometry.numerics import norm
 from ncs_jax.network.methods.method import Method, decode, garment_blend
@@ -40,8 +42,9 @@ def training_metrics(
         x = pose_garment(model, offset, matrices, weights)
         result = {"strain": 100 * jnp.mean(edge_strain(x, mesh))}
         if model.terms.collision is not None:
-            d = distances(x, pose_body(model, matrices), model.surface, model.terms)
-            result["penetrating"] = 100 * jnp.mean(d < 0)
+            surface = required(model.surface, "model.surface")
+            d = distances(with_points(x, surface.points), pose_body(model, matrices), surface, model.terms)
+            result["penetrating"] = 100 * jnp.mean(d[: len(x)] < 0)
         return result
 
     each = (jnp.moveaxis(offsets, -1, 0), track.matrices[ends])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.metrics.quality import measure_on_host, summarise
+from ncs_jax.metrics.quality import PARTS, measure_on_host, summarise
 from ncs_jax.runs.run import Run
 from ncs_jax.view import curves, page, pictures
 from ncs_jax.view.animation import Animation
@@ -51,9 +51,9 @@ def preview(
 
     The alphas are in rows, at moments at which they differ most. The picture and the page come first, the measures last, and
     the page is then written again with them. Strain and penetration are exact, of every n-th frame, so that there are no more
-    than `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body penetrating (%),
-    depth_max, middle_depth_max (mm), as of `metrics.quality`; every, n; measured, frames. Where skin is 1 mm outside: bare, in
-    how many; barest, the worst. Curves need a log and matplotlib.
+    than `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what `metrics.quality`
+    says of penetration; every, n; measured, frames. Where skin is 1 mm outside: bare, in how many; barest, the worst. Curves
+    need a log and matplotlib.
 
     Args:
         run: trained.
@@ -147,7 +147,7 @@ def _measured(run: Run, animation: Animation) -> dict[str, float]:
     rows = measure_on_host(run.assembly.model, animation.garment[::every], skin)
     found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
     if "depth_max" in rows:
-        out = np.maximum(rows["depth_max"], rows["middle_depth_max"])
+        out = np.max([rows[f"{part}depth_max"] for part in PARTS], axis=0)
         found |= {"bare": float((out > BARE).sum()), "barest": float(every * out.argmax())} if out.max() > BARE else {}
     return found
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.contact.points import ContactPoints, with_points
 from ncs_jax.geometry.mesh import corners, topology, vertex_rings
 from ncs_jax.geometry.numerics import normalize
 from ncs_jax.geometry.soa_vectors import cross, direction, minus
@@ -23,7 +24,8 @@ class Surface:
     """What collision needs to know once about the part of the body that a garment can touch.
 
     `cloth_blocks`, `vertex_blocks` and `face_blocks` are compact groups of cloth vertices, body vertices and body faces,
-    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. `vertex_lists` and
+    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. Of cloth with `points`
+    between its vertices these follow the vertices, as in `points.with_points`. `vertex_lists` and
     `face_lists` name the body groups that each cloth group searches first.
     """
 
@@ -40,6 +42,7 @@ class Surface:
     face_lists: Int[Array, "near_groups blocks"]
     spacing: Float[Array, ""]  # mean edge length of the resting body, m
     groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
+    points: ContactPoints | None = None  # of the cloth, where contact looks between its vertices too
 
 
 def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
@@ -78,6 +81,7 @@ def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
 
 def rebuild_lists(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
     """Return the surface with new candidate lists for the nearest-vertex search, from poses [(cloth, body)]."""
+    posed = [(with_points(cloth, surface.points), body) for cloth, body in posed]
     lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
     return replace(surface, vertex_lists=jax.device_put(lists))
 
@@ -89,18 +93,20 @@ def surface_from(
     *,
     smooth: bool = False,
     posed: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+    points: ContactPoints | None = None,
 ) -> Surface:
     """Group the cloth and the touchable body by their rest positions (verts, 3), (body, 3), m; faces (faces, 3) of the body.
 
     `posed`: the two in some poses of the motion, from which to tell what is usually near what; at rest where there is none.
     `smooth`: for `nearby_quadrics`, which takes smaller groups of the body; otherwise for the searches, where the sizes are a
     balance of what a group looks at, what it proves at once and what is left to be searched in full (a coarse garment: smaller
-    groups that look at more, since its far corners leave less proved).
+    groups that look at more, since its far corners leave less proved). `points`: between the cloth's vertices.
     """
-    fine = (16, 8, 32) if len(cloth) >= 2048 else (8, 8, 64)
+    fine = (16, 8, 32) if len(cloth) >= 2048 else (8 if points is None else 16, 8, 64)
+    cloth, posed = with_points(np.asarray(cloth), points), [(with_points(cloth, points), body) for cloth, body in posed]
     cloth_size, body_size, groups = (24, 4, 40) if smooth else fine
     cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
-    cloth, body, faces = np.asarray(cloth), np.asarray(body), np.asarray(faces)
+    body, faces = np.asarray(body), np.asarray(faces)
     cloth_blocks = compact_groups(cloth, cloth_size)
     vertex_blocks, face_blocks = compact_groups(body, body_size), compact_groups(body[faces].mean(axis=1), body_size)
     place = np.zeros(len(cloth), np.int32)
@@ -127,6 +133,7 @@ def surface_from(
         face_lists=jax.device_put(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
         spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
         groups=groups,
+        points=points,
     )
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.contact.collision import collision
+from ncs_jax.energies.contact.points import on_vertices, with_points
 from ncs_jax.energies.contact.smooth import Quadrics, blended_contact, nearby_quadrics
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.terms import Material, Terms
@@ -22,8 +23,8 @@ class Contact(NamedTuple):
 
     energy: Float[Array, ""]  # J
     gradient: Float[Array, "verts 3"]  # N
-    blocks: Float[Array, "verts 3 3"]  # N/m
-    distance: Float[Array, "verts"]  # m
+    blocks: Float[Array, "points 3 3"]  # N/m, of vertices, then of the points between them
+    distance: Float[Array, "points"]  # m, of both
 
 
 def evaluate_contact(
@@ -35,27 +36,38 @@ def evaluate_contact(
     near: Quadrics | None = None,
     only: Int[Array, "some"] | None = None,
 ) -> Contact:
-    """Return the contact of all vertices, each of which touches the body by itself.
+    """Return the contact of all vertices and of the points between them, each of which touches the body by itself.
 
     Args:
         x, body: positions in m. near: the body near the garment, where contact is smooth and it is known already.
-        only: of smooth contact, the vertices that count; the others are taken as far away.
+        only: of smooth contact, the vertices and points that count, padded with how many there are; the others are taken as far
+            away.
     """
-    stiffness = material.collision
+    stiffness, points = material.collision, surface.points
+    x = with_points(x, points)
+    shares = None if points is None else points.shares.astype(x.dtype)
     if terms.collision != "smooth":
         distance, back = jax.vjp(lambda x: distances(x, body, surface, terms), x)
         (normal,) = back(jnp.ones_like(distance))
-        energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness)
+        energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness, shares)
         pushing = jnp.where(distance < material.thickness, 2 * stiffness, 0)
+        pushing = pushing if shares is None else shares * pushing
         blocks = pushing[:, None, None] * normal[:, :, None] * normal[:, None, :]
-        return Contact(energy, slope[:, None] * normal, blocks, distance)
+        return Contact(energy, on_vertices(slope[:, None] * normal, points), blocks, distance)
     near = nearby_quadrics(x, body, surface) if near is None else near
 
     found = blended_contact(x, near, surface, material.thickness, only)
-    energy, gradient = stiffness * jnp.sum(found.shortfall), stiffness * found.slope
-    blocks, distance = 2 * stiffness * found.directions, found.distance
+    lost, gradient, blocks, distance = (
+        found.shortfall,
+        stiffness * found.slope,
+        2 * stiffness * found.directions,
+        found.distance,
+    )
+    if shares is not None:
+        own = shares if only is None else shares.at[only].get(mode="fill", fill_value=0)
+        lost, gradient, blocks = own * lost, own[:, None] * gradient, own[:, None, None] * blocks
     if only is not None:
-        gradient = jnp.zeros_like(x).at[only].set(gradient)
-        blocks = jnp.zeros((*x.shape, 3), x.dtype).at[only].set(blocks)
-        distance = jnp.full(x.shape[:1], jnp.inf, x.dtype).at[only].set(distance)
-    return Contact(energy, gradient, blocks, distance)
+        gradient = jnp.zeros_like(x).at[only].set(gradient, mode="drop")
+        blocks = jnp.zeros((*x.shape, 3), x.dtype).at[only].set(blocks, mode="drop")
+        distance = jnp.full(x.shape[:1], jnp.inf, x.dtype).at[only].set(distance, mode="drop")
+    return Contact(stiffness * jnp.sum(lost), on_vertices(gradient, points), blocks, distance)

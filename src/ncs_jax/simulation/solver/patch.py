@@ -28,6 +28,7 @@ class Patch:
     """Vertices that move, and the model and couplings of every element that they touch; padded elements weigh nothing."""
 
     verts: Int[Array, "size"]
+    touching: Int[Array, "some"]  # those, then the points of contact that they carry, padded with how many there are of both
     place: Int[Array, "verts"]  # in `verts`, or `size` for a vertex that is held
     inside: Int[Array, "pairs"]  # pairs of vertices that both move; padded with the number of all pairs
     model: Model
@@ -44,6 +45,16 @@ def _take(array, rows, filling=0, axis=0):
     return jnp.take(array, rows, axis=axis, mode="fill", fill_value=filling)
 
 
+def _touching(verts, moves, couplings: Couplings):
+    """The vertices and the points of contact that move with any of them, padded, and whether they fit."""
+    points = couplings.points
+    if points is None:
+        return verts, jnp.asarray(True)
+    carried = jnp.any(moves[points.corners] & (points.weights > 0), axis=1)
+    rows, fits = _rows(carried, 2 * SIZE * -(-len(carried) // len(moves)))
+    return jnp.concatenate([verts, len(moves) + rows]), fits
+
+
 def patch_around(score: Float[Array, "verts"], model: Model, couplings: Couplings) -> Patch:
     """Return the patch near the vertices of the highest score: those that lie nearest to them at rest."""
     mesh = model.garment.mesh
@@ -57,6 +68,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
     hinges, fits_hinges = _rows(jnp.any(moves[mesh.hinges], axis=1), 6 * SIZE)
     edges, fits_edges = _rows(jnp.any(moves[mesh.edges], axis=1), 5 * SIZE)
     inside, fits_pairs = _rows(jnp.all(moves[couplings.pairs], axis=1), 8 * SIZE)
+    touching, fits_points = _touching(verts, moves, couplings)
     part = replace(
         mesh,
         faces=_take(mesh.faces, faces),
@@ -74,6 +86,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
     whole = fits_faces & fits_hinges & fits_edges & fits_pairs
     return Patch(
         verts=verts,
+        touching=touching,
         place=place,
         inside=inside,
         model=replace(model, garment=replace(model.garment, mesh=part)),
@@ -84,8 +97,10 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
             _take(couplings.hinge_pairs, hinges, axis=1),
             _take(couplings.hinge_flips, hinges, False, axis=1),
             _take(couplings.edge_pairs, edges),
+            couplings.points,
+            couplings.point_pairs,
         ),
-        whole=whole,
+        whole=whole & fits_points,
     )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact import self_contact
 from ncs_jax.energies.contact.pairs import Pairs, nearby_pairs
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.safe_steps import free_share, swept_share
 from ncs_jax.energies.contact.self_contact import Repulsion, repulsion
 from ncs_jax.energies.contact.smooth import Quadrics, nearby_quadrics
@@ -78,7 +79,7 @@ class Problem:
     inputs: StepInputs  # with `moving` 0 where inertia is left out, and the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     neighbours: Neighbours | None = None
-    only: Int[Array, "some"] | None = None  # the vertices that move, if not all
+    only: Int[Array, "some"] | None = None  # the vertices that move, and the points of contact that they carry, if not all
 
     @property
     def step(self) -> StepInputs:
@@ -148,7 +149,8 @@ def find_neighbours(problem: Problem, x: Float[Array, "verts 3"]) -> Neighbours 
     model = problem.model
     x, quadrics, pairs = lax.stop_gradient(x), None, None
     if model.terms.collision == "smooth":
-        quadrics = nearby_quadrics(x, lax.stop_gradient(required(problem.step.body, "step.body")), problem.surface)
+        body = lax.stop_gradient(required(problem.step.body, "step.body"))
+        quadrics = nearby_quadrics(with_points(x, problem.surface.points), body, problem.surface)
     if model.terms.self_contact:
         pairs = nearby_pairs(x, model.garment.mesh, required(model.garment.groups, "garment.groups"), search_radius(problem))
     return None if quadrics is None and pairs is None else Neighbours(quadrics, pairs, x)
@@ -262,13 +264,22 @@ def collision_free_step(problem: Problem, x: Float[Array, "verts 3"], p: Float[A
     return lax.cond(share < 1, swept, lambda: share)
 
 
-def share_outside_body(contact: Contact | None, p: Float[Array, "verts 3"]):
-    """Return the share of a vertex's way p that does not carry it through the body: to the surface, and a little into it."""
+def share_outside_body(problem: Problem, contact: Contact | None, p: Float[Array, "verts 3"]):
+    """Return the share of a vertex's way p that carries nothing through the body: to the surface, and a little into it.
+
+    What a vertex carries is itself and the points of contact on its triangles.
+    """
     if contact is None:
         return jnp.ones((), p.dtype)
     reach = jnp.maximum(contact.distance, 0) * 0.9 + CLEARANCE
+    points, verts = problem.couplings.points, len(p)
+    p = with_points(p, points)
     length = jnp.sqrt(jnp.sum(p * p, axis=-1))
-    return jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
+    share = jnp.minimum(1, reach / jnp.maximum(length, jnp.finfo(p.dtype).tiny))
+    if points is None:
+        return share
+    carried = jnp.where(points.weights > 0, share[verts:, None], 1)
+    return share[:verts].at[points.corners].min(carried)
 
 
 def accepts(point: Point, new: Point, t, p: Float[Array, "verts 3"]):
@@ -288,7 +299,7 @@ def line_search(
 
     neighbours: found anew where a step goes far; None: as the problem knows them.
     """
-    longest = jnp.min(share_outside_body(point.contact, p))
+    longest = jnp.min(share_outside_body(problem, point.contact, p))
     if problem.model.terms.self_contact:
         longest = jnp.minimum(longest, collision_free_step(with_neighbours(problem, neighbours), x, p))
 

@@ -5,7 +5,7 @@ The matrix is one 3x3 block a vertex and one a pair of vertices that share a fac
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.bending import hinge_weight
 from ncs_jax.energies.contact.friction import SLIP, slipping
+from ncs_jax.energies.contact.points import ContactPoints
 from ncs_jax.energies.membrane import deformation
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
 from ncs_jax.errors import required
@@ -42,10 +43,12 @@ class Couplings:
     hinge_pairs: Int[Array, "6 hinges"]
     hinge_flips: Bool[Array, "6 hinges"]
     edge_pairs: Int[Array, "edges"]  # its block is symmetric: it has no flips
+    points: ContactPoints | None = None  # of contact, between the vertices
+    point_pairs: Int[Array, "3 points"] | None = None  # in the order of `FACE`; symmetric too
 
 
-def couplings_from(mesh: Mesh) -> Couplings:
-    """Return all pairs of vertices that a face or a hinge couples."""
+def couplings_from(mesh: Mesh, points: ContactPoints | None = None) -> Couplings:
+    """Return all pairs of vertices that a face or a hinge couples; `points` of contact couple no others."""
     faces, hinges = np.asarray(mesh.faces), np.asarray(mesh.hinges)
     of_faces = np.stack([faces[:, p] for p in FACE])
     of_hinges = np.stack([hinges[:, p] for p in HINGE])
@@ -58,7 +61,11 @@ def couplings_from(mesh: Mesh) -> Couplings:
         return jnp.asarray(index, jnp.int32), jnp.asarray(p[..., 0] > p[..., 1])
 
     edges, _ = place(np.asarray(mesh.edges))
-    return Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges), edge_pairs=edges)
+    found = Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges), edge_pairs=edges)
+    if points is None:
+        return found
+    corners = np.asarray(points.corners)
+    return replace(found, points=points, point_pairs=place(np.stack([corners[:, p] for p in FACE]))[0])
 
 
 def _membrane(x, mesh: Mesh, density, numbers):
@@ -153,6 +160,18 @@ def _own(x, step: StepInputs, terms: Terms):
     return jnp.transpose(positive_part((block + jnp.swapaxes(block, 0, 2)).transpose(0, 2, 1) / 2), (2, 0, 1))
 
 
+def _with_contact(diagonal, off, couplings: Couplings, contact):
+    """The blocks with those of contact (points, 3, 3), a point's shared out to its corners k and l as w_k w_l."""
+    points, verts = couplings.points, len(diagonal)
+    diagonal = diagonal + contact[:verts]
+    if points is None:
+        return diagonal, off
+    w, between = points.weights.astype(contact.dtype), contact[verts:]
+    both = jnp.stack([w[:, i] * w[:, j] for i, j in FACE])
+    diagonal = diagonal.at[points.corners].add((w * w)[..., None, None] * between[:, None])
+    return diagonal, off.at[couplings.point_pairs].add(both[..., None, None] * between[None])
+
+
 def stiffness(
     x: Float[Array, "verts 3"],
     couplings: Couplings,
@@ -160,7 +179,7 @@ def stiffness(
     material: Material,
     step: StepInputs,
     terms: Terms,
-    contact: Float[Array, "verts 3 3"] | None = None,
+    contact: Float[Array, "points 3 3"] | None = None,
 ) -> tuple[Float[Array, "verts 3 3"], Float[Array, "pairs 3 3"]]:
     """Return blocks of a positive semi-definite Hessian of the total energy without inertia, N/m; arguments as of `energies`.
 
@@ -192,7 +211,7 @@ def stiffness(
         sides = [scaled[:, k, :, None] * gradient[:, other, None, :] for k, other in HINGE]
         off = off.at[couplings.hinge_pairs].add(jnp.stack([turned(p, couplings.hinge_flips[i]) for i, p in enumerate(sides)]))
     if contact is not None:
-        diagonal = diagonal + contact
+        diagonal, off = _with_contact(diagonal, off, couplings, contact)
     if terms.friction:
         diagonal = diagonal + _friction(x, step, material.friction)
     if terms.own:
