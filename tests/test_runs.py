@@ -125,6 +125,13 @@ def test_killed_at_ten_moments_and_resumed(unbroken, tmp_path, plain_jax):
     assert same(out, reference)
 
 
+def test_a_process_with_64_bits_trains_too(tmp_path, plain_jax):
+    """A notebook may have them: the numbers of a batch's frames stay of 32."""
+    with jax.enable_x64(True):
+        run = train(write_scene(tmp_path, FREE), steps=10)
+    assert run.steps == 10 and np.isfinite(run.animate(run.assembly.scene.motion.files[0])).all()
+
+
 def test_a_run_is_not_overwritten(tmp_path, plain_jax):
     scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     train(scene, out, steps=10)

@@ -163,7 +163,7 @@ class PlacedScene:
         seed, batch = self.seed, self.assembly.scene.training.batch
         if required(self.assembly.training, "training").shares is not None:
             seed, first = int(np.random.SeedSequence([seed, 3, self._number]).generate_state(1)[0]), first % self._every
-        return self._last[batches(len(self._last), batch, seed, first, count)]
+        return self._last[batches(len(self._last), batch, seed, first, count)].astype(np.int32)
 
     def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
         ends = self._ends(first, count)
