@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measure import peak_memory
-from experiments.study import apart, axes_of, changed, named, write
+from experiments.study import QUICK_STEPS, apart, axes_of, changed, named, quickened, write
 from ncs_jax import (
     InputError,
     Run,
@@ -244,13 +244,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("scene", nargs="?", default="ncs:tshirt", help="scene file, or ncs:NAME (default: ncs:tshirt)")
     parser.add_argument("--finer", metavar="FILE", help="a finer mesh of the garment (default: the packaged one, where it is)")
     parser.add_argument("--only", nargs="+", default=(), metavar="POINT", help="these points, beside the simulation")
-    parser.add_argument("--quick", action="store_true", help="20 steps of training")
+    parser.add_argument("--quick", action="store_true", help="to try it out, smallest: the numbers mean nothing")
     parser.add_argument("--out", default="runs/speed_accuracy", help="folder for the tables and the picture")
     options = parser.parse_args(arguments)
     try:
         scene = load_scene(options.scene)
         finer = options.finer or (f"{scene.garment.file}_fine" if scene.garment.file.startswith("ncs:") else None)
-        experiment(scene, Path(options.out), finer=finer, only=options.only, steps=20 if options.quick else None)
+        if options.quick:
+            scene, finer = quickened(scene), options.finer
+        steps = QUICK_STEPS if options.quick else None
+        experiment(scene, Path(options.out), finer=finer, only=options.only, steps=steps)
     except InputError as error:
         print(f"speed_accuracy: {error}", file=sys.stderr)
         return 2

@@ -148,7 +148,8 @@ def twins(scene: Scene) -> dict[str, Scene]:
     return {
         "dynamic": dynamic,
         "coarse": changed(dynamic, simulation={"tolerance": COARSE}),
-        "static": changed(dynamic, physics={"inertia": False}),
+        # every frame is sought far from rest, as a first one
+        "static": changed(dynamic, physics={"inertia": False}, simulation={"iterations": 10 * scene.simulation.iterations}),
     }
 
 

@@ -150,7 +150,7 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         step = step_inputs(model, matrices, past, transforms=transforms, force=force)
         exact = settings.exact_pins and len(model.garment.pins) > 0
         pinned = skin(transforms, rest)[model.garment.pins] if exact else None
-        problem = Problem(model, simulator.couplings, simulator.order, step, pinned)
+        problem = Problem(model, simulator.couplings, simulator.order, step, pinned, first=~state.started)
         advected = skin(transforms, state.unposed)
         problem = with_neighbours(problem, find_neighbours(problem, advected))
         start = _expected(problem, state, advected, transforms)

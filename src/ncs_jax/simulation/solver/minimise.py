@@ -154,7 +154,8 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     mass = jnp.sum(problem.mass)
     usual = 0.1 if start.dtype == jnp.float32 else 0.001
     tolerance = usual if settings.tolerance is None else settings.tolerance
-    limit = jnp.where(problem.moving > 0, settings.iterations, settings.first)
+    first = problem.moving <= 0 if problem.first is None else problem.first
+    limit = jnp.where(first, settings.first, settings.iterations)
 
     def unfinished(state):
         *_, status, _, iteration = state

@@ -80,6 +80,7 @@ class Problem:
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     neighbours: Neighbours | None = None
     only: Int[Array, "some"] | None = None  # the vertices that move, and the points of contact that they carry, if not all
+    first: Bool[Array, ""] | None = None  # whether no frame was before; None: a static one is taken for that
 
     @property
     def step(self) -> StepInputs:
