@@ -62,14 +62,14 @@ def contact_points(faces: np.ndarray, area: np.ndarray, pieces: np.ndarray, vert
         weights.append(np.tile(nodes / n, (len(cut), 1)))
         shares.append(counts.ravel())
     _, first, place = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
-    corners, weights = faces[np.concatenate(owners)][first], np.concatenate(weights)[first]
+    corners, carried = faces[np.concatenate(owners)][first], np.concatenate(weights)[first]
     total = np.bincount(place.reshape(-1), np.concatenate(shares))
-    vertex, between = weights.max(axis=1) == 1, weights.max(axis=1) < 1
+    vertex, between = carried.max(axis=1) == 1, carried.max(axis=1) < 1
     own = np.ones(verts)  # of a vertex without a triangle
-    own[corners[vertex, weights[vertex].argmax(axis=1)]] = total[vertex]
+    own[corners[vertex, carried[vertex].argmax(axis=1)]] = total[vertex]
     return ContactPoints(
         corners=jax.device_put(corners[between].astype(np.int32)),
-        weights=jnp.asarray(weights[between]),
+        weights=jnp.asarray(carried[between]),
         shares=jnp.asarray(np.concatenate([own, total[between]])),
     )
 
