@@ -214,8 +214,8 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
             return None
         modes = replace(modes, by_pose=as_about_the_drape(model, count))
         slope = _range(scene, replace(model, vibrations=modes), track)
-        arrays = {"vibrations": modes.directions, "energy": modes.energy, "slope": slope, "by_pose": modes.by_pose}
-        return {name: np.asarray(array) for name, array in (arrays | {"drape": modes.drape}).items()}
+        arrays = modes.directions, modes.energy, slope, modes.by_pose, modes.drape
+        return {name: np.asarray(array) for name, array in zip(SWING, arrays, strict=True)}
 
     return replace(prepared, **(kept(SWING, found, smooth, track, str(scene.network)) or {}))
 
