@@ -252,7 +252,7 @@ def test_skirt_is_pinned_at_the_waistband(name):
 @pytest.mark.parametrize("name", ["dress", "dress_fine"])
 def test_dress_hangs_from_shoulders_and_waist_and_is_wide_at_the_hem(name):
     dress, body = load(name), load("body")
-    vertices, weights = dress["vertices"].astype(float), dress["blend_weights"]
+    vertices = dress["vertices"].astype(float)
     edges, count = edge_counts(dress["faces"])
     rim = vertices[edges[count == 1]]
     low = rim[:, :, 1].max(1) < vertices[:, 1].min() + 0.01
@@ -262,9 +262,6 @@ def test_dress_hangs_from_shoulders_and_waist_and_is_wide_at_the_hem(name):
     length = (1.035 - vertices[:, 1].min()) / 0.8  # along the cloth, which is a cone whose radius grows by 0.6 of it
     assert 1.035 - length == pytest.approx(0.28, abs=0.03)  # on the calf
     assert (hem - 0.69) / length > 1.1 * np.pi  # as it opens from a waist of 0.69 m: half a circle would be pi
-    assert np.abs(weights.sum(1) - 1).max() == 0 and weights.min() >= 0
-    hips = weights[:, list(body["joint_names"]).index("Hips")]
-    assert (hips[vertices[:, 1] < 0.83] > 0.99).all() and (hips[vertices[:, 1] > 1.04] < 0.1).all()
 
 
 @pytest.mark.parametrize("name", MOTIONS)

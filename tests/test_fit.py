@@ -167,36 +167,6 @@ def test_what_lies_on_top_of_the_body_needs_no_pins(body):
     assert "pins" not in found.garment.groups and found.carried > 0.01
 
 
-@pytest.mark.slow
-def test_weights_do_not_tear_a_skirt_between_the_legs():
-    """Skinned alone, edges of the packaged skirt, walking, are 1.8 times as long by averaging, and 1.2 at most so."""
-    import jax.numpy as jnp
-
-    from ncs_jax.geometry.rotations import axis_angle_to_matrix
-    from ncs_jax.geometry.skinning import Skeleton, blend, blend_from, forward, skin, transforms
-    from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights
-
-    body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
-    found = fit("skirt.npz", skirt, body, move=(0, 0, 0)).garment
-    edges, rest = topology(skirt.faces)[0], skirt.vertices
-    plain = smooth_weights(transfer_weights(rest, body.vertices, body.faces, body.weights), edges, 10)
-    skeleton = Skeleton(jnp.asarray(body.joints, jnp.float32), tuple(int(p) for p in body.parents))
-    local = axis_angle_to_matrix(jnp.asarray(io.read_motion(ASSETS / "walk.npz").poses[::10], jnp.float32))
-
-    def stretch(weights):
-        worst = 0
-        for pose in local:
-            matrices = transforms(skeleton, forward(skeleton, pose, jnp.zeros(3, jnp.float32)))
-            x = np.asarray(skin(blend(matrices, blend_from(weights)), jnp.asarray(rest, jnp.float32)))
-            long = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
-            worst = max(worst, (long / np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)).max())
-        return worst
-
-    assert stretch(plain) > 1.5 and stretch(found.weights) < 1.2
-    np.testing.assert_allclose(found.weights.sum(axis=1), 1, atol=1e-12)
-    assert found.weights.min() >= 0
-
-
 def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     scene = write_scene(tmp_path)
     given = sleeve(0.075)
@@ -211,7 +181,7 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     text = scene.read_text().replace('"cloth.npz"', '"fitted.npz"\npins = "pins"')
     scene.write_text(text)
     a = assemble(load_scene(scene))
-    np.testing.assert_allclose(a.prepared.weights, written.weights, atol=1e-7)
+    assert written.weights is None and len(a.prepared.weights) == len(written.vertices)
     assert main(["check", str(scene), "--out", str(tmp_path / "check.png")]) == 0
     assert "inside the body at rest" not in capsys.readouterr().out
     assert main([*command, str(tmp_path / "fitted.obj")]) == 2

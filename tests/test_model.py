@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from ncs_jax.geometry.enclosure import ENCLOSED, enclosure
 from ncs_jax.geometry.mesh import topology
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import (
@@ -27,10 +28,10 @@ from ncs_jax.geometry.skinning import (
 from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io import read_body, read_garment
 from ncs_jax.io.packaged import packaged
-from ncs_jax.io.records import BodyRecord
-from ncs_jax.prepare.posing import corrected_rest
-from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import enclosure, touchable, touchable_part
+from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
+from ncs_jax.prepare.skinning_weights import hung_weights, smooth_weights, transfer_weights, used_joints
+from ncs_jax.prepare.touchable import touchable, touchable_part
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import GarmentSpec, Scene, load_scene
@@ -67,6 +68,40 @@ def test_a_body_vertex_between_faces_gives_its_own_weights():
     weights = body["blend_weights"]
     found = transfer_weights(body["vertices"], body["vertices"], body["faces"], weights)
     np.testing.assert_allclose(found, weights, atol=1e-5)
+
+
+def test_a_wide_skirt_goes_where_a_thigh_goes():
+    """A thigh raised by 75 degrees to the side stays within the skinned dress; by the hips alone it passes through."""
+    body, dress = read_body(packaged("body")), read_garment(packaged("dress"))
+    joint = {name: j for j, name in enumerate(body.joint_names)}
+    lying = transfer_weights(dress.vertices, body.vertices, body.faces, body.weights)
+    hung = hung_weights(dress, body, lying)
+    np.testing.assert_allclose(hung.sum(axis=1), 1, atol=1e-9)
+    assert hung.min() >= 0
+    skirt, left = dress.vertices[:, 1] < 0.8, dress.vertices[:, 0] * np.sign(body.joints[joint["LeftUpLeg"], 0])
+    thigh = hung[:, joint["LeftUpLeg"]]
+    assert thigh[skirt & (left > 0.35)].min() > 0.5 and thigh[skirt & (left < -0.35)].mean() < 0.15
+    assert hung[skirt][:, [joint["LeftLeg"], joint["RightLeg"]]].sum(axis=1).max() < 0.1  # a bent knee hardly counts
+    arms = [j for name, j in joint.items() if "Arm" in name or "Hand" in name]
+    assert hung[skirt][:, arms].max() < 0.001
+    hips = np.where(skirt[:, None], np.eye(len(joint))[joint["Hips"]], lying)
+    pose = np.zeros((len(joint), 3))
+    pose[joint["LeftUpLeg"], 2] = np.radians(75) * np.sign(body.joints[joint["LeftUpLeg"], 0])
+    skin = np.flatnonzero(body.weights[:, joint["LeftUpLeg"]] > 0.9)
+    (transforms,) = joint_transforms(body, pose[None])
+    raised = carried(body.vertices, blend_from(body.weights), transforms)[skin]
+
+    def within(weights):
+        return enclosure(raised, carried(dress.vertices, blend_from(weights), transforms), dress.faces) > ENCLOSED
+
+    assert within(hung).mean() > 0.99 and within(hips).mean() < 0.8
+
+
+def test_cloth_that_lies_close_keeps_its_weights():
+    body, shirt = read_body(packaged("body")), read_garment(packaged("tshirt"))
+    close = GarmentRecord(shirt.vertices[(shirt.vertices[:, 1] > 1.2)], np.zeros((0, 3), np.int32))
+    weights = transfer_weights(close.vertices, body.vertices, body.faces, body.weights)
+    assert hung_weights(close, body, weights) is weights
 
 
 def test_smoothing_is_the_mean_of_the_neighbours_again_and_again(rng):
@@ -211,8 +246,9 @@ def test_a_wide_skirt_touches_the_legs_that_it_stands_off():
     """No leg is within reach of the packaged dress at rest, which stands off as a cone."""
     body, dress = read_body(packaged("body")), read_garment(packaged("dress"))
     scene = Scene(garment=GarmentSpec("ncs:dress"))
-    found = touchable_part(scene, body, dress, dress.weights, [])
-    near = touchable(body, dress.vertices, blend_from(dress.weights), np.zeros((0, 31, 3)), scene.physics.collision.reach)
+    weights = transfer_weights(dress.vertices, body.vertices, body.faces, body.weights)
+    found = touchable_part(scene, body, dress, weights, [])
+    near = touchable(body, dress.vertices, blend_from(weights), np.zeros((0, 31, 3)), scene.physics.collision.reach)
     shins = np.flatnonzero((body.vertices[:, 1] > 0.2) & (body.vertices[:, 1] < 0.4))
     assert np.isin(shins, found).all() and not near[shins].any()
 

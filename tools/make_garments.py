@@ -16,10 +16,6 @@ from remeshing import clip, mirror, remesh, vertex_normals
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
-from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
-from ncs_jax.io import BodyRecord, GarmentRecord
-from ncs_jax.prepare.fit import spread_weights
-
 CELL = 0.008  # m
 CLEARANCE = 0.004  # m, kept by the script; the tests ask for 3 mm
 UNDER_FACES = 0.0015  # m, body vertices stay at least this far under the garment's faces
@@ -51,8 +47,6 @@ def make_garments(body: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray
             if name.startswith("skirt"):
                 top = vertices[:, 1].max()
                 out[name]["group_pins"] = np.flatnonzero(vertices[:, 1] > top - WAISTBAND).astype(np.int32)
-            if cut is _dress:
-                out[name]["blend_weights"] = _hung_weights(vertices, faces, body)
     return out
 
 
@@ -181,20 +175,6 @@ def _dress(body: dict[str, np.ndarray]) -> tuple:
     armhole = -_smooth_min(points[..., 0] - across + 0.018, points[..., 1] - height + 0.105, 0.06)
     wanted = {"middle": points[..., 0], "hem": points[..., 1] - hem, "armhole": armhole, "neck": collar}
     return _surface(low, field, wanted)
-
-
-def _hung_weights(vertices: np.ndarray, faces: np.ndarray, body: dict[str, np.ndarray]) -> np.ndarray:
-    """Weights (V, J) of a bodice that follows the body and of a skirt that follows the hips, and no leg or hand."""
-    dense = np.zeros((len(body["vertices"]), len(body["joints"])), np.float32)
-    np.add.at(dense, (np.arange(len(dense))[:, None], body["weight_joints"]), body["weights"])
-    wearer = BodyRecord(body["vertices"], body["faces"], body["joints"], body["parents"], dense)
-    away = distance_and_direction(vertices, wearer.vertices, wearer.faces, border_of(wearer.faces, len(wearer.vertices)))
-    weights, _ = spread_weights(GarmentRecord(vertices, faces), wearer, *away)
-    hung = _ramp(WAIST - vertices[:, 1:2], 0.0, 0.2)
-    weights = weights * (1 - hung) + hung * (np.arange(len(ORDER)) == ORDER.index("Hips"))
-    weights = np.round(weights * 256)
-    weights[np.arange(len(weights)), weights.argmax(1)] += 256 - weights.sum(1)
-    return (weights / 256).astype(np.float32)
 
 
 def _surface(low: np.ndarray, field: np.ndarray, wanted: dict[str, np.ndarray]) -> tuple:

@@ -193,8 +193,8 @@ def _say_what(found, given) -> None:
         print(f"  pins      {len(g.groups[PINS])} vertices around its highest opening: nothing else carries it")
     else:
         print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
-    spread = f"the body's where it lies on it, {100 * found.lying:.0f} % of the vertices, and spread smoothly from there"
-    print("  weights   " + ("the file's own" if given.weights is not None else spread))
+    own = "the file's own" if given.weights is not None else "those of the skin, found when the scene is made ready"
+    print(f"  weights   {own}")
 
 
 def _say_contact(contact) -> None:

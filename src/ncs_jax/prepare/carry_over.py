@@ -19,23 +19,25 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.mesh import topology
+from ncs_jax.geometry.mesh import adjacency, topology
 from ncs_jax.geometry.surface_distance import border_of, closest_on_surface, distance_and_direction
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.records import BodyRecord, GarmentRecord
-from ncs_jax.prepare.fit import lying_on, spread, spread_weights
 from ncs_jax.prepare.joint_names import Limbs, anatomy
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.posing import skinned
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.skeleton import body_axes, least_turn
+from ncs_jax.prepare.skinning_weights import transfer_weights
 
-__all__ = ["Carried", "carry_over"]
+__all__ = ["Carried", "carry_over", "spread_weights"]
 
 BONES = {"arm": "forearm", "forearm": "hand", "hand": "", "thigh": "shin", "shin": "foot", "foot": "toe"}  # and where they end
 NEEDED = ("left arm", "right arm", "left thigh", "right thigh")  # roles that both bodies must have
 ROUNDS = (0.2, 0.1, 0.05, 0.03, 0.02, 0.02)  # m; over how much of the skin what it lacks is smoothed, round by round
 ALIKE = 0.5  # least cosine between normals of skin that corresponds
+LYING, SMOOTH = 0.02, 0.03  # m; see `spread_weights`
+LEAST = 1e-6  # how much what lies far from the body counts
 STRAINED = 0.5  # a garment of which a twentieth of the edges is strained by more was made for a body of another kind
 
 
@@ -114,7 +116,7 @@ def carry_over(garment: GarmentRecord, source: BodyRecord, target: BodyRecord, f
     maps, turns, ours, theirs = _maps(source, target, file)
     laid = _laid(skinned(skin, source.weights, maps), ours, theirs)
     away = distance_and_direction(x, skin, corners, border_of(corners, len(skin)))
-    moved = skinned(x, spread_weights(garment, source, *away)[0], maps)
+    moved = skinned(x, spread_weights(garment, source, *away), maps)
     near = closest_on_surface(x, skin, corners)
     under, there, weights = (
         np.einsum("vk,vk...->v...", near.weights, values[corners[near.face]]) for values in (skin, laid, source.weights)
@@ -213,3 +215,45 @@ def _laid(x: np.ndarray, ours: _Parts, theirs: _Parts) -> np.ndarray:
         trust = np.where((part[near.face] == ours.skin) & (alike > ALIKE), alike, 0.0)
         x = x + spread(x, edges, trust, -near.gap, smooth)
     return x
+
+
+# --- over the cloth -------------------------------------------------------------------------------------------------
+
+
+def spread_weights(garment: GarmentRecord, body: BodyRecord, distance: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Return smooth skinning weights (V, J) that follow the body where cloth lies on it.
+
+        min_w  sum_v c_v (w_v - w_body(v))^2 + (L / l)^2 sum_(edges v-u) (w_v - w_u)^2,
+        c_v = exp(-(d / L0)^2) max(n . n_body, 0)
+
+    d is the distance to the body (m), l the mean edge, L = `SMOOTH` and L0 = `LYING`. So cloth that hangs free between the legs
+    follows the cloth that it hangs on, and is not torn to either side. Weights are 0 to 1 and sum to 1, because the inverse of
+    the system's matrix is positive. Source: the matching of Abdrashitov et al. 2023, with a smooth c_v instead of a threshold.
+    """
+    edges = topology(garment.faces)[0]
+    own = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+    trust = lying_on(garment, distance, away)
+    weights = np.maximum(spread(garment.vertices, edges, trust, own), 0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def lying_on(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Return how much each vertex (V,) lies on the body, c of `spread_weights`, from 0 to 1."""
+    facing = np.maximum(np.sum(vertex_normals(garment.vertices, garment.faces) * away, axis=1), 0)
+    return np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing
+
+
+def spread(x: np.ndarray, edges: np.ndarray, trust: np.ndarray, values: np.ndarray, smooth: float = SMOOTH) -> np.ndarray:
+    """Return values (V, K) of a surface's vertices, smoothed, so that those of little `trust` (V,) follow those around them.
+
+        min_u  sum_v c_v (u_v - value_v)^2 + (L / l)^2 sum_(edges v-w) (u_v - u_w)^2,
+
+    with c the trust, l the mean edge and L the length to smooth over, m.
+    """
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    graph, trust = adjacency(edges, len(x)), trust + LEAST
+    stiff = (smooth / np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).mean()) ** 2
+    system = diags_array(trust) + stiff * (diags_array(graph.sum(axis=1)) - graph)
+    return splu(system.tocsc()).solve(trust[:, None] * values)

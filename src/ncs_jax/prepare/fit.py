@@ -1,4 +1,4 @@
-"""A garment fitted to a body: placed on it, pushed out of it, pinned where nothing carries it, weighted to follow it."""
+"""A garment fitted to a body: placed on it, pushed out of it, pinned where nothing carries it."""
 
 from __future__ import annotations
 
@@ -17,15 +17,12 @@ from ncs_jax.prepare.covering import Cover, contact_for, sinking
 from ncs_jax.prepare.garment_checks import FAR
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
-from ncs_jax.prepare.skinning_weights import transfer_weights
 
-__all__ = ["PINS", "Fitted", "fit", "lying_on", "pins_of", "push_out", "settle", "spread", "spread_weights"]
+__all__ = ["PINS", "Fitted", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
 PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
 NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
-LYING, SMOOTH = 0.02, 0.03  # m; see `spread_weights`
-LEAST = 1e-6  # how much what lies far from the body counts
 OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away from the body
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
 CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
@@ -36,17 +33,16 @@ BAND = 0.02  # m; height of a waistband
 class Fitted:
     """A garment on a body, and what was done to bring it there.
 
-    garment: in metres and Y up, with weights and, where nothing carries it, the group `pins`. placement: where it was found to
+    garment: in metres and Y up and, where nothing carries it, with the group `pins`. placement: where it was found to
     belong, before it was pushed out. depth: of every vertex inside the body, before and after the push, m, negative outside.
-    carried: its area that lies on what faces up, m^2. lying: share of its vertices that follow the skin. contact: the thickness
-    and stiffness of a collision that keep the skin from showing through.
+    carried: its area that lies on what faces up, m^2. contact: the thickness and stiffness of a collision that keep the skin
+    from showing through.
     """
 
     garment: GarmentRecord
     placement: Placement
     depth: tuple[np.ndarray, np.ndarray]
     carried: float
-    lying: float
     contact: Cover
 
 
@@ -56,7 +52,7 @@ def fit(file: str | Path, garment: GarmentRecord, body: BodyRecord, *, clearance
 
 
 def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float | None = None) -> Fitted:
-    """Push a placed garment out of the body, pin and weight it. Its own group `pins` and its own weights, if any, are kept.
+    """Push a placed garment out of the body, and pin it. Its own group `pins` and its own weights, if any, are kept.
 
     Args:
         file: the garment's, for errors. placement: from `place`. clearance: least distance of every vertex from the body, m;
@@ -80,12 +76,10 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
         )  # fmt: skip
     placed = replace(placed, vertices=x.astype(placed.vertices.dtype))
     away = _away_from(body, placed.vertices)
-    weights, lying = spread_weights(placed, body, *away)
     pins, carried = pins_of(placed, *away)
     groups = placed.groups if PINS in placed.groups or not len(pins) else {**placed.groups, PINS: pins}
-    weights = weights if placed.weights is None else placed.weights
     depth = -_away_from(body, before)[0], -away[0]
-    return Fitted(replace(placed, groups=groups, weights=weights), placement, depth, carried, lying, contact)
+    return Fitted(replace(placed, groups=groups), placement, depth, carried, contact)
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
@@ -132,7 +126,7 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
     return x + moved
 
 
-# --- pins and weights -----------------------------------------------------------------------------------------------
+# --- pins -----------------------------------------------------------------------------------------------------------
 
 
 def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> tuple[np.ndarray, float]:
@@ -157,44 +151,3 @@ def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> t
 
     near, _ = cKDTree(x[top]).query(x)
     return np.flatnonzero(near <= BAND).astype(np.int32), carried
-
-
-def spread_weights(
-    garment: GarmentRecord, body: BodyRecord, distance: np.ndarray, away: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return smooth skinning weights (V, J) that follow the body where cloth lies on it; and the share of vertices that do so.
-
-        min_w  sum_v c_v (w_v - w_body(v))^2 + (L / l)^2 sum_(edges v-u) (w_v - w_u)^2,
-        c_v = exp(-(d / L0)^2) max(n . n_body, 0)
-
-    d is the distance to the body (m), l the mean edge, L = `SMOOTH` and L0 = `LYING`. So cloth that hangs free between the legs
-    follows the cloth that it hangs on, and is not torn to either side. Weights are 0 to 1 and sum to 1, because the inverse of
-    the system's matrix is positive. Source: the matching of Abdrashitov et al. 2023, with a smooth c_v instead of a threshold.
-    """
-    edges = topology(garment.faces)[0]
-    own = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
-    trust = lying_on(garment, distance, away)
-    weights = np.maximum(spread(garment.vertices, edges, trust, own), 0)
-    return weights / weights.sum(axis=1, keepdims=True), float((trust > 0.5).mean())
-
-
-def lying_on(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Return how much each vertex (V,) lies on the body, c of `spread_weights`, from 0 to 1."""
-    facing = np.maximum(np.sum(vertex_normals(garment.vertices, garment.faces) * away, axis=1), 0)
-    return np.exp(-((np.maximum(distance, 0) / LYING) ** 2)) * facing
-
-
-def spread(x: np.ndarray, edges: np.ndarray, trust: np.ndarray, values: np.ndarray, smooth: float = SMOOTH) -> np.ndarray:
-    """Return values (V, K) of a surface's vertices, smoothed, so that those of little `trust` (V,) follow those around them.
-
-        min_u  sum_v c_v (u_v - value_v)^2 + (L / l)^2 sum_(edges v-w) (u_v - u_w)^2,
-
-    with c the trust, l the mean edge and L the length to smooth over, m.
-    """
-    from scipy.sparse import diags_array
-    from scipy.sparse.linalg import splu
-
-    graph, trust = adjacency(edges, len(x)), trust + LEAST
-    stiff = (smooth / np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).mean()) ** 2
-    system = diags_array(trust) + stiff * (diags_array(graph.sum(axis=1)) - graph)
-    return splu(system.tocsc()).solve(trust[:, None] * values)

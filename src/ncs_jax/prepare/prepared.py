@@ -12,7 +12,7 @@ from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.prepare.contact_detail import bent_most, pieces_of, posed_skins
-from ncs_jax.prepare.skinning_weights import smooth_weights, transfer_weights, used_joints
+from ncs_jax.prepare.skinning_weights import hung_weights, smooth_weights, transfer_weights, used_joints
 from ncs_jax.prepare.touchable import covered_by_layers, submesh, touchable_part
 from ncs_jax.scene.model import Layer
 from ncs_jax.scene.spec import Scene
@@ -73,6 +73,7 @@ def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prep
     weights = garment.weights
     if weights is None:
         weights = transfer_weights(garment.vertices, body.vertices, body.faces, body.weights)
+        weights = hung_weights(garment, body, weights)
         weights = smooth_weights(weights, np.asarray(files.mesh.edges), scene.garment.smoothing)
     part = np.zeros(0, np.int64)
     if scene.physics.collision.stiffness > 0:

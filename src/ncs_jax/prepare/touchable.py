@@ -8,6 +8,7 @@ import numpy as np
 from ncs_jax import io
 from ncs_jax.energies.contact.points import contact_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
+from ncs_jax.geometry.enclosure import ENCLOSED, enclosure
 from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
@@ -15,7 +16,7 @@ from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
 
-__all__ = ["covered_by_layers", "enclosure", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = ["covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
 
 def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, poses: np.ndarray, reach: float) -> np.ndarray:
@@ -33,29 +34,6 @@ def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, po
         distance, _ = cKDTree(cloth).query(skin, distance_upper_bound=reach)
         near |= np.isfinite(distance)
     return near
-
-
-ENCLOSED = 0.25  # of a full turn: what a garment surrounds by so much at rest may be touched by it, however far it stands off
-
-
-def enclosure(x: np.ndarray, garment: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return by how much a garment surrounds each point (points,): the absolute winding number of its vertices' area vectors,
-
-        w(x) = | sum_v (x_v - x) . a_v / (4 pi |x_v - x|^3) |,    a_v = sum of a third of the area vectors of v's triangles.
-
-    It is near 1 in a closed surface, 0 far outside, and some half in an opening. Good to a hundredth where points are farther
-    from the garment than its edges are long (`test_enclosure_is_the_winding_number_away_from_the_cloth`). Source: Barill et al.
-    2018, the first term of their expansion.
-    """
-    a, b, c = (np.asarray(garment, np.float32)[faces[:, k]] for k in range(3))
-    area = np.zeros(garment.shape, np.float32)
-    np.add.at(area, faces, (np.cross(b - a, c - a) / 6)[:, None])
-    found = np.zeros(len(x))
-    for some in np.array_split(np.arange(len(x)), -(-len(x) * len(garment) // 1_000_000) or 1):
-        apart = np.asarray(garment, np.float32) - np.asarray(x, np.float32)[some, None]
-        cubed = np.maximum(np.einsum("pvi,pvi->pv", apart, apart), 1e-12) ** 1.5
-        found[some] = np.abs(np.sum(np.einsum("pvi,vi->pv", apart, area) / cubed, axis=1)) / (4 * np.pi)
-    return found
 
 
 COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
