@@ -1,7 +1,7 @@
 """Draw a trained garment over a motion as an animated GIF: the picture of the README.
 
-    ncs train ncs:skirt --minutes 6 --out runs/skirt
-    python -m tools.make_gif runs/skirt docs/swing.gif --motion ncs:dance --frames 30 210
+    make demo
+    python -m tools.make_gif runs/demo docs/swing.gif --motion ncs:cmu_spin --frames 0 84
 
 Takes half a minute. It is drawn at 15 frames per second, with fewer colours until it is below 3 MB.
 """
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.make_gif", description=__doc__.splitlines()[0])
     parser.add_argument("run", metavar="RUN", help="folder that ncs train made")
     parser.add_argument("out", metavar="FILE", help="the GIF")
-    parser.add_argument("--motion", default="ncs:dance", help="motion file or ncs:NAME (default: ncs:dance)")
+    parser.add_argument("--motion", default="ncs:cmu_spin", help="motion file or ncs:NAME (default: ncs:cmu_spin)")
     parser.add_argument("--frames", type=int, nargs=2, default=(0, None), metavar=("FIRST", "END"), help="of the motion")
     parser.add_argument("--alpha", type=float, default=1.0, help="how much the garment moves (default: 1)")
     parser.add_argument("--view", default="three-quarter", help="front, three-quarter, side or back")
