@@ -72,6 +72,12 @@ def test_adapted_is_a_run_that_goes_on_and_does_nothing_twice(trained, tmp_path,
         adapt(other, clip, MOMENT, out)
 
 
+def test_a_run_that_is_adapted_stays_as_it_is_where_nothing_is_written(trained):
+    run, clip = load_run(trained / "run"), str(trained / "clip.npz")
+    first, second = (adapt(run, clip, MOMENT) for _ in range(2))
+    assert same(first.run, second.run) and not same(first.run, run) and same(run, load_run(trained / "run"))
+
+
 def test_interrupted_it_keeps_its_weights_and_goes_on(trained, tmp_path):
     out, clip = tmp_path / "adapted", str(trained / "clip.npz")
 

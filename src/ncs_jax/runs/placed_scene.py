@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jax.stages import Compiled
@@ -61,9 +62,12 @@ class PlacedScene:
         return 1 if self.mesh is None else self.mesh.size
 
     def initial_state(self, params: dict | None = None) -> TrainState:
-        """Return the state that the seed gives, with parameters of another run if there are any, in this process alone."""
+        """Return the state that the seed gives, in this process alone; with parameters of another run, if there are any.
+
+        These are copied, as training uses up the arrays of its state.
+        """
         state = initial_state(self.model, self.assembly.network, self.seed)
-        return state if params is None else replace(state, params=params)
+        return state if params is None else replace(state, params=jax.tree.map(jnp.array, params))
 
     def copied(self, tree):
         """Return the first process's arrays on every device."""
