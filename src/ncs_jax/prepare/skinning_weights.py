@@ -13,7 +13,7 @@ from ncs_jax.geometry.surface_distance import closest_on_surface
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 
-__all__ = ["NEAR", "hung_weights", "smooth_weights", "transfer_weights", "used_joints", "with_body_weights"]
+__all__ = ["hung_weights", "smooth_weights", "transfer_weights", "used_joints", "with_body_weights"]
 
 NEAR, FREE = 0.05, 0.15  # m; cloth that is nearer to the skin that it surrounds follows it as it lies; farther, it hangs free
 REACH, STEP = 2.0, 0.05  # times the nearest distance, and m; see `hung_weights`
