@@ -11,6 +11,8 @@ from ncs_jax.cli.train import adapted
 from ncs_jax.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ncs_jax.io import MotionRecord
     from ncs_jax.prepare.build import Assembly
     from ncs_jax.runs.run import Run
@@ -32,6 +34,12 @@ def add_commands(commands) -> None:
         type=arguments.finite,
         default=1.0,
         help="how much the garment moves: 0 static, 1 as trained, more exaggerates",
+    )
+    parser.add_argument(
+        "--refine",
+        type=arguments.whole,
+        metavar="N",
+        help="take N iterations of the solver on every frame, say 4: the more, the nearer to the simulation (default: none)",
     )
     parser.add_argument(
         "--rank", type=arguments.whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
@@ -69,10 +77,12 @@ def animate(options) -> int:
         worn_by = run.assembly.body, motion
     vertices, error = run.animate(motion, options.alpha), ""
     if options.rank or options.bfloat16:
-        smaller = run.compressed(motion, rank=options.rank or 0, bfloat16=options.bfloat16)
-        whole, vertices = vertices, smaller.animate(motion, options.alpha)
+        run = run.compressed(motion, rank=options.rank or 0, bfloat16=options.bfloat16)
+        whole, vertices = vertices, run.animate(motion, options.alpha)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
+    if options.refine:
+        vertices = _refined(run, motion, options)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
     names = arguments.mesh_names(run.assembly.scene)
@@ -85,6 +95,19 @@ def animate(options) -> int:
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0
+
+
+def _refined(run: Run, motion: MotionRecord, options) -> np.ndarray:
+    """Return the animation after some iterations of the solver on every frame, with a bar."""
+    from ncs_jax.cli.progress import WorkProgress
+
+    with WorkProgress("compiling the solver") as progress:
+        return run.animate(
+            motion,
+            options.alpha,
+            refine=options.refine,
+            report=lambda frame, frames: progress.show(f"refining frame {frame}/{frames}", frame, frames),
+        )
 
 
 def _run_and_motion(options) -> tuple[Run, MotionRecord]:

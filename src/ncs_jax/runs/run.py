@@ -69,8 +69,18 @@ class Run:
         known = name.startswith("ncs:") or name in (*a.scene.motion.files, *a.scene.motion.validation)
         return load_motion(a.scene, name if known else str(Path(name).absolute()), a.body)
 
-    def animate(self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0) -> np.ndarray:
+    def animate(
+        self,
+        motion: str | io.MotionRecord | MotionFeatures,
+        alpha: float = 1.0,
+        *,
+        refine: int = 0,
+        report: Callable[[int, int], None] | None = None,
+    ) -> np.ndarray:
         """Return garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
+
+        refine: iterations of the solver on every frame, see `simulation.refinement`; `report` is called after each with the
+        frame, and of how many.
 
         Raises:
             InputError: alpha is not finite; or a vertex is not: where, and what was so first.
@@ -86,7 +96,14 @@ class Run:
             raise InputError(
                 "finite vertices expected", file=what, field=broken, value=f"alpha {alpha:g}", mend="see ncs check"
             )
-        return x
+        if not refine:
+            return x
+        if refine < 0:
+            raise InputError("no fewer than 0 iterations expected", field="refine", value=refine)
+        self.check_terms()
+        from ncs_jax.runs.refine import refined  # the solver, which is not loaded otherwise
+
+        return refined(a, track, x, refine, report)
 
     def compressed(self, motion: str | io.MotionRecord | MotionFeatures, *, rank: int = 0, bfloat16: bool = False) -> Run:
         """Return this garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.

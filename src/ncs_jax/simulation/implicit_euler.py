@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact.safe_steps import limit_approach
 from ncs_jax.geometry.skinning import blend, forward, skin, unpose
@@ -138,8 +138,13 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         return SimulationState(rest, rest, rest, rest, jnp.asarray(False), nothing)
 
     def follow(
-        state: SimulationState, matrices: Float[Array, "joints 3 4"], force: Float[Array, "verts 3"] | None = None
+        state: SimulationState,
+        matrices: Float[Array, "joints 3 4"],
+        force: Float[Array, "verts 3"] | None = None,
+        start: Float[Array, "verts 3"] | None = None,
+        limit: Int[Array, ""] | None = None,
     ) -> tuple[SimulationState, Float[Array, "verts 3"]]:
+        # start: where the search begins, m; None: where the last frame leads. limit: of iterations, for `settings.iterations`.
         # seen from the root joint: float32 tells places 5 m off no finer than 0.5 um, which in a pin of 1000 N/m is 1 mN
         origin = lax.stop_gradient(matrices[:1, :, 3])
         matrices = matrices.at[:, :, 3].add(-origin)
@@ -150,10 +155,14 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         step = step_inputs(model, matrices, past, transforms=transforms, force=force)
         exact = settings.exact_pins and len(model.garment.pins) > 0
         pinned = skin(transforms, rest)[model.garment.pins] if exact else None
-        problem = Problem(model, simulator.couplings, simulator.order, step, pinned, first=~state.started)
+        problem = Problem(model, simulator.couplings, simulator.order, step, pinned, first=~state.started, limit=limit)
         advected = skin(transforms, state.unposed)
-        problem = with_neighbours(problem, find_neighbours(problem, advected))
-        start = _expected(problem, state, advected, transforms)
+        if start is None:
+            problem = with_neighbours(problem, find_neighbours(problem, advected))
+            start = _expected(problem, state, advected, transforms)
+        else:
+            start = lax.stop_gradient(hold_pins(problem, start - origin))
+            problem = with_neighbours(problem, find_neighbours(problem, start))
         if model.terms.self_contact:
             last = jnp.where(state.started, hold_pins(problem, previous), start)
             problem, start = _approached(problem, *map(lax.stop_gradient, (last, advected, start)))

@@ -155,7 +155,7 @@ def minimise(settings: Settings, problem: Problem, start: Float[Array, "verts 3"
     usual = 0.1 if start.dtype == jnp.float32 else 0.001
     tolerance = usual if settings.tolerance is None else settings.tolerance
     first = problem.moving <= 0 if problem.first is None else problem.first
-    limit = jnp.where(first, settings.first, settings.iterations)
+    limit = jnp.where(first, settings.first, settings.iterations) if problem.limit is None else problem.limit
 
     def unfinished(state):
         *_, status, _, iteration = state

@@ -81,6 +81,7 @@ class Problem:
     neighbours: Neighbours | None = None
     only: Int[Array, "some"] | None = None  # the vertices that move, and the points of contact that they carry, if not all
     first: Bool[Array, ""] | None = None  # whether no frame was before; None: a static one is taken for that
+    limit: Int[Array, ""] | None = None  # of iterations; None: the settings'
 
     @property
     def step(self) -> StepInputs:
