@@ -55,7 +55,7 @@ def measure_seen(
         raise InputError("finite vertices expected", field="vertices", value=f"frame {bad}", mend="see ncs check")
     cloth = np.asarray(model.garment.mesh.faces)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        rows = {"self_intersecting": [100.0 * f.mean() for f in pool.map(lambda frame: crossed(frame, cloth), x)]}
+        rows = {"self_intersecting": np.array([100.0 * f.mean() for f in pool.map(lambda frame: crossed(frame, cloth), x)])}
         if model.surface is not None:
             faces = np.asarray(model.surface.faces)
             skin = covered_skin(resting_body(model), faces, np.asarray(model.garment.mesh.rest), cloth)
@@ -67,7 +67,7 @@ def measure_seen(
             body = _bodies(model, track, chosen)
             through, shown, seen = (np.array(part, np.float64) for part in zip(*pool.map(look, range(len(x))), strict=True))
             rows |= {"body_intersecting": through, "skin_pixels": shown, "skin_share": 100 * shown / np.maximum(seen, 1)}
-    return {name: np.asarray(row) for name, row in rows.items()}
+    return rows
 
 
 def _bodies(model: Model, track: MotionFeatures, chosen: np.ndarray) -> np.ndarray:
