@@ -47,6 +47,7 @@ from ncs_jax import InputError, Run, Scene, assemble, io, scene_from, summarise
 from ncs_jax.cli import arguments
 from ncs_jax.io.mesh.garment import FORMATS
 from ncs_jax.metrics.quality import measure
+from ncs_jax.metrics.seen import measure_seen
 from ncs_jax.prepare.fit import PINS, settle
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.motion_import import load_motion
@@ -79,6 +80,8 @@ COLUMNS = {
     "within_1mm": "penetrating at 1 mm, %",
     "penetrating": "inside, %",
     "self_intersecting": "self-intersections, %",
+    "body_intersecting": "triangles through the body, %",
+    "skin_share": "skin seen, %",
     "out_of_balance": "out of balance, g",
     "distance": "mm to simulation",
     "minutes": "training, min",
@@ -184,7 +187,8 @@ def rows_of(
     judge = Run(assemble(twins(scene.without_network())["dynamic"]), {})
     found = {}
     for k, (motion, vertices) in enumerate(zip(task.measured, animations, strict=True)):
-        found[motion] = measure(judge.assembly.model, vertices, judge.track(motion), self_contact=True)
+        model, track = judge.assembly.model, judge.track(motion)
+        found[motion] = measure_seen(model, vertices, track) | measure(model, vertices, track, self_contact=True)
         if beside:
             away = np.linalg.norm(np.subtract(vertices, beside[k], dtype=np.float64), axis=-1)
             found[motion]["distance"] = 1000 * away.mean(axis=-1)

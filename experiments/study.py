@@ -28,6 +28,7 @@ from ncs_jax.io import read_motion
 from ncs_jax.io.tables.npz import write_npz
 from ncs_jax.metrics.motion import compare_dynamics, compare_motion, measure_motion
 from ncs_jax.metrics.quality import measure
+from ncs_jax.metrics.seen import measure_seen
 from ncs_jax.network.methods.method import Method
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.spec import split_frames
@@ -49,6 +50,8 @@ COLUMNS = {
     "total": "energy, J",
     "strain_mean": "strain, %",
     "penetrating": "inside, %",
+    "skin_share": "skin seen, %",
+    "body_intersecting": "triangles through the body, %",
     "dynamic_share": "dynamic share",
     "hem_correlation": "hem correlation",
     "distance": "mm to simulation",
@@ -231,7 +234,9 @@ def judged(run: Run, motion: str, vertices: np.ndarray, static: np.ndarray | Non
     """
     scene = run.assembly.scene
     simulated, other = (reference(scene, motion, kept, twin) for twin in ("dynamic", "coarse"))
-    found = summarise(measure(run.assembly.model, vertices, run.track(motion))) | moving(run, motion, vertices, simulated)
+    model, track = run.assembly.model, run.track(motion)
+    found = summarise(measure_seen(model, vertices, track) | measure(model, vertices, track))
+    found |= moving(run, motion, vertices, simulated)
     found["sensitivity"] = 1000 * float(np.linalg.norm(np.subtract(simulated, other, dtype=np.float64), axis=-1).mean())
     if static is not None:
         parts = compare_dynamics(vertices, static, simulated, reference(scene, motion, kept, "static"))

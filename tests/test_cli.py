@@ -570,6 +570,12 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     assert main(["evaluate", str(folder), "--json"]) == 0
     (whole,) = json.loads(capsys.readouterr().out).values()
     assert len(whole["frames"]["total"]) == 24 and {"strain_mean", "penetrating", "out_of_balance"} <= set(whole["mean"])
+    run = load_run(folder)
+    (name,) = run.assembly.scene.motion.files
+    rows = run.evaluate(name)
+    assert not {"skin_pixels", "skin_share", "body_intersecting", "self_intersecting"} & set(run.evaluate(name, seen=0))
+    for seen in ("skin_pixels", "skin_share", "body_intersecting", "self_intersecting"):  # of one frame in five
+        assert len(whole["frames"][seen]) == 5 and whole["frames"][seen] == rows[seen].tolist(), seen
     assert main(["animate", str(folder), "--out", str(tmp_path / "a.npz")]) == 0
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path / "a.npz"), "--scene", str(scene), "--json"]) == 0
@@ -580,7 +586,7 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
         assert again["mean"][name] == pytest.approx(value, rel=2e-3, abs=1e-3), name
     assert main(["evaluate", str(folder)]) == 0
     text = capsys.readouterr().out
-    assert "strain_mean [%]" in text and "out_of_balance [g]" in text
+    assert "strain_mean [%]" in text and "out_of_balance [g]" in text and "skin_share [%], " in text
     assert main(["evaluate", str(tmp_path / "a.npz")]) == 2
     one_line(capsys, ["--scene"])
 

@@ -9,7 +9,7 @@ from PIL import Image
 from ncs_jax import InputError, io, train
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.view.character import animation_of, body_vertices
-from ncs_jax.view.live import BINS, COLOURS, View, animated_garment, colour_bins, vertex_values, view
+from ncs_jax.view.live import BINS, COLOURS, THROUGH, View, animated_garment, colour_bins, vertex_values, view
 
 from .scenes import write_scene
 from .test_viewer import BROWSER
@@ -70,6 +70,14 @@ def test_colours_are_of_what_they_say(carried):
         depth.max() == pytest.approx(20, abs=1.5)
         and not vertex_values("distance inside the body", run, x, track, 0, None).any()
     )
+    through = vertex_values(THROUGH, run, inside, track, 0, None)
+    assert set(through) == {0.0, 100.0} and through[depth > 0].all()  # what is inside, and the triangles that go in
+    assert (through > 0).sum() > (depth > 0).sum()
+    assert not vertex_values(THROUGH, run, x, track, 0, None).any()
+    folded = x.copy()
+    right = x[0, :, 0] > 0.02
+    folded[0, right] = x[0, right] * [-1, 1, 1] + np.array([-0.013, 0, 0.02]) - 0.6 * (x[0, right, :1] - 0.05) * [0, 0, 1]
+    assert 0 < vertex_values(THROUGH, run, folded, track, 0, None).mean() < 100
     u = x.copy()
     u[4] += np.array([0, 0.01, 0], np.float32)
     np.testing.assert_allclose(vertex_values("speed as seen from the body", run, u, track, 4, None), 300, rtol=2e-2)

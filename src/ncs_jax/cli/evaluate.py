@@ -18,7 +18,10 @@ __all__ = ["add_commands", "evaluate"]
 def add_commands(commands) -> None:
     """Declare the options."""
     parser = arguments.command(
-        commands, "evaluate", evaluate, "measure strain, shear, penetration, energies and forces out of balance"
+        commands,
+        "evaluate",
+        evaluate,
+        "measure strain, shear, penetration, skin that shows, energies and forces out of balance",
     )
     parser.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
     parser.add_argument("--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: all of the scene's)")
@@ -27,7 +30,7 @@ def add_commands(commands) -> None:
     parser.add_argument(
         "--reference", metavar="FILE", help="an animation of the same motion, say by ncs simulate, to compare the movement with"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON, with every frame")
+    parser.add_argument("--json", action="store_true", help="print JSON, with every frame; of skin that shows, one in five")
 
 
 def _scene(options) -> Scene | None:
@@ -48,13 +51,15 @@ def evaluate(options) -> int:
 
     from ncs_jax.metrics.motion import compare_motion, measure_motion
     from ncs_jax.metrics.quality import measure, summarise
+    from ncs_jax.metrics.seen import measure_seen
     from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 
     rows, moving, beyond = {}, {}, {}
 
     def look(run, name, track, vertices):
         model = run.assembly.model
-        rows[name], moving[name] = measure(model, vertices, track), measure_motion(model, vertices, track)
+        rows[name] = measure_seen(model, vertices, track) | measure(model, vertices, track)
+        moving[name] = measure_motion(model, vertices, track)
         if options.reference is None:
             return
         reference = read_animation_over(options.reference, model, track)

@@ -53,7 +53,8 @@ MEASURED = (
     *("step", "strain", "moved", "dropped", "seconds"),
     *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max"),
     *("middle_penetrating", "middle_depth_max", "centre_penetrating", "centre_depth_max"),
-    *("within_1mm", "self_intersecting", "out_of_balance", "gradient_norm", "outside", "speed", "lag", "settling", "overshoot"),
+    *("within_1mm", "self_intersecting", "body_intersecting", "skin_pixels", "skin_share"),
+    *("out_of_balance", "gradient_norm", "outside", "speed", "lag", "settling", "overshoot"),
     *("gain", "dynamic_share", "stopped_share", "hem_correlation", "distance"),
     *("static_distance", "dynamic_correlation", "dynamic_factor"),
 )

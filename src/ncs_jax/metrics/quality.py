@@ -32,7 +32,7 @@ from ncs_jax.geometry.numerics import angle_between
 from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.metrics.penetration import depths_in, depths_on_host
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.model import Model, pose_body, resting_body
 from ncs_jax.scene.step_inputs import Past, step_inputs
 
 __all__ = ["PARTS", "QUANTITIES", "measure", "measure_on_host", "summarise"]
@@ -50,7 +50,10 @@ QUANTITIES = {
     "middle_depth_max": ("mm", "deepest penetration of an edge's middle: skin that shows between vertices"),
     "centre_penetrating": ("%", "triangles whose centre is inside the body"),
     "centre_depth_max": ("mm", "deepest penetration of a triangle's centre"),
-    "self_intersecting": ("%", "triangles that pass through another one of the garment, where that is asked for"),
+    "self_intersecting": ("%", "triangles that pass through another one of the garment"),
+    "body_intersecting": ("%", "triangles of the garment that one of the body passes through"),
+    "skin_pixels": ("px", "pixels of six views in which skin shows through the garment that covers it at rest"),
+    "skin_share": ("%", "the same as a share of the pixels that show the garment, or skin through it"),
     "outside": ("%", "frames beyond the poses and speeds that the network was trained on"),
     "out_of_balance": ("g", "mass-weighted r.m.s. of M^-1 grad E, as a multiple of 9.81 m/s^2"),
     "gradient_norm": ("N", "mean length of a vertex's row of grad E"),
@@ -153,9 +156,8 @@ def _intersections(mesh: Mesh, groups: Groups, frames: _Frames) -> dict[str, Flo
 def _surface_of_all(model: Model) -> Surface:
     """Return the body as vertices and middles of edges and triangles look for it."""
     mesh = model.garment.mesh
-    body = np.concatenate([model.body, *(layer.rest for layer in model.under)])
     faces = np.asarray(required(model.surface, "model.surface").faces)
-    return surface_from(np.asarray(with_middles(mesh.rest, mesh.edges, mesh.faces)), body, faces)
+    return surface_from(np.asarray(with_middles(mesh.rest, mesh.edges, mesh.faces)), resting_body(model), faces)
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {

@@ -23,7 +23,7 @@ from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.prepare.setting import RECURRENT, Setting
 from ncs_jax.prepare.speed_checks import speed_faults
 from ncs_jax.prepare.touchable import touchable_faces
-from ncs_jax.scene.model import Model
+from ncs_jax.scene.model import Model, resting_body
 from ncs_jax.scene.spec import Scene
 
 __all__ = ["RANGES", "Risk", "find_risks", "motion_risks"]
@@ -138,7 +138,7 @@ def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
     if collision.stiffness == 0:
         return
     rest, own = np.asarray(model.garment.mesh.rest, np.float64), np.asarray(model.garment.mesh.faces)
-    below = np.concatenate([required(model.body, "model.body"), *(layer.rest for layer in model.under)])
+    below = resting_body(model)
     wanted = contact_for(rest, own, sinking(rest, own, below, faces, a.prepared.pieces))
     pressed = least_thickness(0.0, vertex_share(rest, own), collision.stiffness)
     if wanted.sinking < FLAT or collision.thickness >= wanted.sinking + pressed:

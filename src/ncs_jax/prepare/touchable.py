@@ -14,7 +14,7 @@ from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest
+from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest, resting_body
 
 __all__ = ["covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
@@ -84,7 +84,7 @@ def surface_of(
     if track is not None:
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
         poses = list(zip(*map(np.asarray, _worn(model, track.matrices[frames])), strict=True))
-    rest, body = np.asarray(model.garment.mesh.rest), np.concatenate([model.body, *(layer.rest for layer in model.under)])
+    rest, body = np.asarray(model.garment.mesh.rest), resting_body(model)
     mesh = model.garment.mesh
     points = contact_points(np.asarray(mesh.faces), np.asarray(mesh.face_area), pieces, len(rest)) if pieces.size else None
     return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)

@@ -280,7 +280,7 @@ def _filled(records: Sequence[MotionRecord]) -> list[MotionRecord]:
 
 def _measured(run: Run) -> dict[str, float]:
     """Return energy and skin of a garment over all frames of the motions of its scene."""
-    rows = [run.evaluate(name) for name in run.assembly.scene.motion.files]
+    rows = [run.evaluate(name, seen=0) for name in run.assembly.scene.motion.files]
     return summarise({key: np.concatenate([r[key] for r in rows]) for key in MEASURES if key in rows[0]})
 
 

@@ -17,6 +17,7 @@ from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion
 from ncs_jax.metrics.quality import measure
+from ncs_jax.metrics.seen import EVERY, measure_seen
 from ncs_jax.network.compression import compress
 from ncs_jax.network.methods.method import Method, check_network
 from ncs_jax.network.rollout import animated, first_broken
@@ -159,15 +160,17 @@ class Run:
             raise InputError(what, field="terms", value=self.lacking, mend=mend)
 
     def evaluate(
-        self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0, *, exact: bool = True
+        self, motion: str | io.MotionRecord | MotionFeatures, alpha: float = 1.0, *, exact: bool = True, seen: int = EVERY
     ) -> dict[str, np.ndarray]:
         """Return physical quantities per frame: see `metrics.quality.QUANTITIES` and `metrics.quality.measure`.
 
-        Of a run that knows what it was trained on, `outside` says which frames are beyond that, see `coverage`.
+        Of a run that knows what it was trained on, `outside` says which frames are beyond that, see `coverage`. What a person
+        sees is of one frame in `seen`, and of none for 0 or where the measures are not `exact`, see `metrics.seen`.
         """
         self.check_terms()
-        track = self.track(motion)
-        rows = measure(self.assembly.model, self.animate(track, alpha), track, exact=exact)
+        model, track = self.assembly.model, self.track(motion)
+        x = self.animate(track, alpha)
+        rows = (measure_seen(model, x, track, seen) if exact and seen else {}) | measure(model, x, track, exact=exact)
         found = None if self.trained is None else self.coverage(track)
         return rows if found is None else rows | {"outside": 100.0 * found.outside}
 

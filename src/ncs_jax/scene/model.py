@@ -18,7 +18,17 @@ from ncs_jax.errors import InputError, required, shaped
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import Blend, Correctives, Skeleton, blend, corrected, skin, to_rest_axes
 
-__all__ = ["Layer", "Model", "RitzModes", "local_rotations", "pose_body", "pose_garment", "pose_rest", "posed_bodies"]
+__all__ = [
+    "Layer",
+    "Model",
+    "RitzModes",
+    "local_rotations",
+    "pose_body",
+    "pose_garment",
+    "pose_rest",
+    "posed_bodies",
+    "resting_body",
+]
 
 
 @jax.tree_util.register_dataclass
@@ -121,6 +131,11 @@ def pose_garment(
 def pose_rest(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, "verts 3"]:
     """Return the garment as the body alone carries it, equation (16) without offsets, m."""
     return skin(blend(matrices, model.blend), model.garment.mesh.rest)
+
+
+def resting_body(model: Model) -> np.ndarray:
+    """Return the touchable body at rest and the garments under this one, (body, 3) in m, as `model.surface` numbers them."""
+    return np.concatenate([required(model.body, "model.body"), *(layer.rest for layer in model.under)])
 
 
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:

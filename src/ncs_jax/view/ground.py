@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageFilter
 
+from ncs_jax.geometry.depth_buffer import rasterise, sample
 from ncs_jax.view.camera import Projection
-from ncs_jax.view.depth_buffer import rasterise, sample
 from ncs_jax.view.lighting import ShadowMap
 
 __all__ = ["Ground", "draw_ground"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from PIL import Image, ImageFilter
 
-from ncs_jax.view.depth_buffer import rasterise, sample
+from ncs_jax.geometry.depth_buffer import rasterise, sample
 
 __all__ = ["ShadowMap", "linear", "shade"]
 

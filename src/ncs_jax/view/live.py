@@ -18,6 +18,7 @@ from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import edge_strain
+from ncs_jax.geometry.triangle_crossings import crossed
 from ncs_jax.metrics.motion import carried, unposed
 from ncs_jax.runs.run import Run, assemble, load_run, read_animation_over
 from ncs_jax.scene.features import MotionFeatures
@@ -29,11 +30,13 @@ __all__ = ["COLOURS", "AnimatedGarment", "View", "animated_garment", "colour_bin
 
 CLOTH, SKIN, WORN, OTHER = (221, 91, 49), (176, 168, 160), (128, 153, 178), (70, 130, 180)
 BINS = 16  # colours of a scale
+THROUGH = "inside the body, or through it or the cloth"  # vertices, and those of triangles that another one passes through
 # What a colour can measure: its unit and the value at the scale's end.
 COLOURS = {
     "strain": ("%", 10.0),
     "speed as seen from the body": ("mm/s", 500.0),
     "distance inside the body": ("mm", 5.0),
+    THROUGH: ("%", 100.0),
     "distance to the overlay": ("mm", 50.0),
 }
 
@@ -90,8 +93,10 @@ def _motions(motion: str | None, spec) -> tuple[str, ...]:
 
 
 @jax.jit
-def _depth(model: Model, surface: Surface, x, matrices):
-    return -nearest_distance(x, pose_body(model, matrices), surface)
+def _inside(model: Model, surface: Surface, x, matrices):
+    """Return how deep vertices are inside the body, m, and the body."""
+    body = pose_body(model, matrices)
+    return -nearest_distance(x, body, surface), body
 
 
 def vertex_values(
@@ -111,12 +116,23 @@ def vertex_values(
         return 1000 * model.fps * np.linalg.norm(u[-1] - u[0], axis=1)
     if name.startswith("distance to"):
         return 1000 * np.linalg.norm(x - other[frame], axis=1) if other is not None else np.zeros(len(x))
-    if model.surface is None:
-        return np.zeros(len(x))
     origin = np.asarray(track.matrices[frame, 0, :, 3])
     local = jnp.asarray(track.relative(x[None])[0] - origin, model.basis.dtype)
     matrices = track.matrices[frame].at[:, :, 3].add(-origin)
-    return 1000 * np.maximum(np.asarray(_depth(model, model.surface, local, matrices)), 0)
+    depth, body = (np.zeros(len(x)), None) if model.surface is None else _inside(model, model.surface, local, matrices)
+    depth = 1000 * np.maximum(np.asarray(depth), 0)
+    return depth if name != THROUGH else 100.0 * ((depth > 0) | _through(model, np.asarray(local), body))
+
+
+def _through(model: Model, x: np.ndarray, body: jax.Array | None) -> np.ndarray:
+    """Return which vertices (verts,) are of triangles that one of the garment or of the body passes through."""
+    faces = np.asarray(model.garment.mesh.faces)
+    found = crossed(x, faces)
+    if body is not None and model.surface is not None:
+        found |= crossed(x, faces, np.asarray(body), np.asarray(model.surface.faces))
+    marked = np.zeros(len(x), bool)
+    marked[faces[found]] = True
+    return marked
 
 
 def colour_bins(values: np.ndarray, faces: np.ndarray, most: float) -> np.ndarray:

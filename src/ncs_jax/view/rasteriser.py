@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ncs_jax.geometry.depth_buffer import rasterise
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.view.camera import Camera, Projection
-from ncs_jax.view.depth_buffer import rasterise
 from ncs_jax.view.ground import Ground, draw_ground
 from ncs_jax.view.lighting import ShadowMap, linear, shade
 
