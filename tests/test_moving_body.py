@@ -314,9 +314,8 @@ SAME = """
 file = "ncs:tshirt"
 [physics.collision]
 distance = "smooth"
-friction = {}
 [simulation]
-tolerance = 1e-6
+tolerance = 1e-7
 precision = "double"
 iterations = 300
 """
@@ -325,16 +324,17 @@ iterations = 300
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_jax")
 def test_a_walk_given_as_meshes_is_simulated_as_with_the_skinned_body(tmp_path):
-    """To 0.1 mm in every vertex and frame: contact is the same, and a frame's equilibrium does not depend on its start."""
+    """To 0.1 mm in every vertex and frame. Both touch the whole body: the width of smooth contact is by the part's edges."""
     motion = packaged_walk(tmp_path, 20)
     body = io.read_body("ncs:body")
     write_objs(tmp_path / "objs", 100 * body_vertices(body, io.read_motion(motion)) @ TURNS["z"].T, body.faces)
-    (tmp_path / "a.toml").write_text(f'[motion]\nfiles = ["{motion}"]\nup = "y"\n' + SAME.format(0.0))
-    (tmp_path / "b.toml").write_text('[body]\nfile = "objs"\nfps = 30\nscale = 0.01\nup = "z"\n' + SAME.format(0.0))
+    (tmp_path / "a.toml").write_text(f'[body]\npart = "all"\n[motion]\nfiles = ["{motion}"]\nup = "y"\n' + SAME)
+    (tmp_path / "b.toml").write_text('[body]\npart = "all"\nfile = "objs"\nfps = 30\nscale = 0.01\nup = "z"\n' + SAME)
     skinned, meshes = (simulate(tmp_path / name) for name in ("a.toml", "b.toml"))
     assert skinned.status.max() == meshes.status.max() == 0 and meshes.vertices.shape == skinned.vertices.shape
     assert np.ptp(meshes.vertices, axis=0).max() > 0.05  # it moves
-    assert np.linalg.norm(skinned.vertices - meshes.vertices, axis=-1).max() < 1e-4
+    apart = np.linalg.norm(skinned.vertices - meshes.vertices, axis=-1).max(axis=1)
+    assert apart.max() < 1e-4, apart
 
 
 @pytest.mark.slow
