@@ -10,17 +10,19 @@ import trimesh
 from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
 from ncs_jax.geometry.mesh import topology
+from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare import garment_placement
-from ncs_jax.prepare.fit import BAND, fit
+from ncs_jax.prepare.fit import BAND, bring_apart, fit, settle
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.hanging import RAYS, trunk_of
 from ncs_jax.prepare.wearing import cloth_of, skin_of
 
 from .scenes import post, write_scene
 from .shapes import tube
+from .starts import twenty_starts
 
 
 @pytest.fixture
@@ -284,3 +286,64 @@ def test_a_skirt_off_its_place_is_refused_with_the_unit_and_the_place_that_its_w
     assert np.linalg.norm(found.garment.vertices - skirt.vertices, axis=1).mean() < 0.05
     with pytest.raises(InputError, match=r"girth of its waist.*--scale 0\.0254 --up=z --move"):
         found.check("g.obj")
+
+
+# --- starts that intersect ------------------------------------------------------------------------------------------------
+
+
+def test_triangles_that_pass_through_each_other_are_found():
+    """Against every edge and triangle tried by itself; triangles that share a vertex, touch, or lie in a plane do not count."""
+    x = np.random.default_rng(0).random((60, 3))
+    faces = np.arange(60).reshape(20, 3)
+    found = {tuple(sorted(pair)) for pair in crossing_pairs(x, faces).tolist()}
+
+    def through(p, q, a, b, c):
+        volume = lambda *t: np.linalg.det([v - t[0] for v in t[1:]])  # noqa: E731
+        around = [volume(p, q, *side) for side in ((a, b), (b, c), (c, a))]
+        return volume(p, a, b, c) * volume(q, a, b, c) < 0 and abs(sum(np.sign(around))) == 3
+
+    expected = {
+        (i, j)
+        for i, j in itertools.combinations(range(20), 2)
+        for one, other in ((i, j), (j, i))
+        for k in range(3)
+        if through(x[3 * one + k], x[3 * one + (k + 1) % 3], *x[3 * other : 3 * other + 3])
+    }
+    assert found == expected and len(expected) > 20
+    flat, both = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0], [1, 1, 0], [0, 0, 1]], float), [[0, 1, 2], [3, 4, 5]]
+    assert not len(crossing_pairs(flat, np.array([[0, 1, 2], [1, 2, 3]])))
+    assert not len(crossing_pairs(flat * [1, 1, 0], np.array(both)))
+    assert not len(crossing_pairs(flat, np.array(both)))  # a corner in the other's inside touches it
+    assert len(crossing_pairs(flat - [[0, 0, 0.1 * (k > 2)] for k in range(6)], np.array(both))) == 1
+
+
+REFUSED = {
+    *("shirt hem through", "shirt folded", "shirt spike", "skirt spike"),
+    *(f"{garment} pressed through the back" for garment in ("shirt", "skirt")),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n for n in twenty_starts() if "crumple" in n or "spike" in n or "0.9" in n]
+    + [pytest.param(n, marks=pytest.mark.slow) for n in twenty_starts() if not ("crumple" in n or "spike" in n or "0.9" in n)],
+)
+def test_a_start_that_intersects_ends_without_or_is_refused_with_its_faces(name):
+    """Ten garments in the body, ten through themselves: none is written that still is."""
+    given, body = twenty_starts()[name], io.read_body("ncs:body")
+    through = len(crossing_pairs(given.vertices, given.faces))
+    assert bool(through) != ("pushed" in name or "scaled" in name)
+    found = place("x.npz", given, body, move=(0.0, 0.0, 0.0), scale=1.0, up="y", turn=0)
+    if name in REFUSED:
+        with pytest.raises(InputError, match=r"not pass through itself.*pairs: \d+ and \d+ at \("):
+            settle("x.npz", found, body)
+        return
+    settled = settle("x.npz", found, body)
+    assert not len(crossing_pairs(settled.garment.vertices, settled.garment.faces))
+    assert settled.depth[1].max() < 0
+
+
+def test_cloth_that_is_apart_stays_as_it_is(body):
+    garment = sleeve()
+    x = garment.vertices.astype(np.float64)
+    assert bring_apart(x, garment.faces, body, 0.004) is x

@@ -112,7 +112,7 @@ def test_nothing_goes_in_circles():
     assert not set(left) - done, {n: left[n] - done for n in set(left) - done}
 
 
-SCENE_FILES = {"scene.spec", "scene.motion_names", "scene.motion_lists"}
+SCENE_FILES = {"scene.spec", "scene.parsing", "scene.motion_names", "scene.motion_lists"}
 
 
 @pytest.mark.parametrize("name", [m for m in MODULES if room(m) in ("io", "errors") or m in SCENE_FILES])

@@ -34,6 +34,7 @@ BLENDER = (
     "  in Blender's Mesh Cache: Forward Z, Up -Y (on an object that is turned by 90 degrees about X, as an .obj's import does: "
     "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
 )
+MOVING = ("scale", "up", "fps", "mesh")  # what a scene says of a body that is a mesh for each frame
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
 
@@ -51,6 +52,11 @@ def add_body(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
     )
+    mesh = parser.add_argument_group("a body that is a mesh for each frame (folder of .obj, .npz, .h5, .pc2, .mdd, USD)")
+    mesh.add_argument("--body-scale", type=positive, default=0.0, metavar="M", help="metres a unit, 0.01 for cm (default: 1)")
+    mesh.add_argument("--body-up", choices=("x", "y", "z"), default="", help="the axis that is up in it (default: y)")
+    mesh.add_argument("--body-fps", type=positive, default=0.0, metavar="N", help="frames per second, for the scene")
+    mesh.add_argument("--body-mesh", default="", metavar="FILE", help="mesh with the faces of a .pc2 or .mdd")
 
 
 def add_adapting(parser: argparse.ArgumentParser) -> None:
@@ -78,16 +84,35 @@ def body_of(options):
     """Return the body that the options of `add_body` mean."""
     from ncs_jax import io
 
+    own = {name: getattr(options, f"body_{name}") for name in MOVING}
+    if io.is_moving_body(options.body):
+        for name in ("part", "betas"):
+            if value := getattr(options, name):
+                raise InputError("a character expected for this option", field=f"--{name}", value=value, mend="leave it out")
+        from ncs_jax.prepare.curve_skeleton import with_curve_skeleton
+
+        return with_curve_skeleton(io.read_moving_body(options.body, **own | {"mesh": own["mesh"] or None}))
+    for name, value in own.items():
+        if value:
+            raise InputError(
+                "a mesh for each frame expected for this option", field=f"--body-{name}", value=value, mend="leave it out"
+            )
     return io.read_body(options.body, betas=options.betas, part=options.part)
+
+
+def _from(file: str, folder: Path) -> str:
+    """Return a file's path as a scene in a folder names it."""
+    return file if file.startswith("ncs:") or Path(file).is_absolute() else os.path.relpath(file, folder).replace(os.sep, "/")
 
 
 def body_table(options, folder: Path) -> str:
     """Return the lines of a scene file in a folder that mean the body of these options."""
-    file = options.body
-    if not file.startswith("ncs:") and not Path(file).is_absolute():
-        file = os.path.relpath(file, folder).replace(os.sep, "/")
-    lines = [f"[body]\nfile = {json.dumps(file)}"]
+    lines = [f"[body]\nfile = {json.dumps(_from(options.body, folder))}"]
     lines += [f"{name} = {json.dumps(value)}" for name in ("part", "betas") if (value := getattr(options, name))]
+    own = {name: getattr(options, f"body_{name}") for name in MOVING}
+    if own["mesh"]:
+        own["mesh"] = _from(own["mesh"], folder)
+    lines += [f"{name} = {json.dumps(value)}" for name, value in own.items() if value]
     return "\n".join(lines)
 
 

@@ -151,10 +151,14 @@ def _tell_scene(setting: Setting, *, automatic: bool) -> None:
         tell("note", note)
     for name, layer in zip(setting.scene.garment.over, model.under, strict=False):
         tell("over", f"{name}: {len(layer.rest)} vertices")
-    tell("joints", listed(joints, {name: name for name in joints}))
+    moving = setting.body is not None and setting.body.frames is not None  # of which no network reads joints
+    if not moving:
+        tell("joints", listed(joints, {name: name for name in joints}))
     if len(model.garment.pins):
         tell("pins", f"{len(model.garment.pins)} vertices of the group {setting.scene.garment.pins}")
     tell("energies", ", ".join(on) + (f" ({terms.membrane})" if terms.membrane else ""))
+    if moving:
+        return
     network = setting.scene.network
     swings = network.method == "ncs" and network.cell == "swing" and terms.inertia
     if past := [name for name in ("inertia", "friction") if name in on and (swings or network.method == "pbns")]:
@@ -222,12 +226,36 @@ def _worst_first(groups: Sequence[Sequence[str]], setting: Setting, risks: Seque
     return sorted((sorted(group, key=order) for group in groups), key=lambda group: order(group[0])[0])
 
 
+def _draw_frames(out: str, setting: Setting) -> None:
+    """Draw some frames of a body that is a moving mesh, with the garment as that alone carries it."""
+    import numpy as np
+
+    from ncs_jax.io.records import shown_frames
+    from ncs_jax.prepare.posing import skinned
+    from ncs_jax.view.animation import Animation, PosedBody
+    from ncs_jax.view.heading import up_of
+    from ncs_jax.view.pictures import contact_sheet
+
+    body, garment = setting.body, setting.garment
+    if body is None or body.frames is None or body.carriers is None:
+        return
+    some = shown_frames(len(body.frames))
+    cloth = np.array([skinned(garment.vertices, setting.prepared.weights, each) for each in body.carriers[some]])
+    up, times = up_of(setting.scene.physics.gravity), tuple(f"{k / body.fps:.2f} s" for k in some)
+    worn_on = PosedBody(body.frames[some], body.faces)
+    contact_sheet(out, Animation(cloth, garment.faces, body.fps, worn_on, up), frames=len(some), labels=times)
+
+
 def _draw(out: str, setting: Setting, groups: Sequence[Sequence[str]]) -> str:
     """Draw one motion of each group; return what the picture shows, nothing where there is none to draw."""
-    if setting.body is None or not groups:
+    moving = setting.body is not None and setting.body.frames is not None
+    if setting.body is None or not (groups or moving):
         return ""
     _say("drawing the motions")
     try:
+        if moving:
+            _draw_frames(out, setting)
+            return f"{out}: the mesh in some frames, and the garment as that alone carries it"
         from ncs_jax.view.motion_sheet import motion_sheet
 
         chosen = {name if len(group) == 1 else f"{name}  (and {len(group) - 1} alike)": setting.motions[name]

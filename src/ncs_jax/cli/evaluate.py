@@ -83,11 +83,13 @@ def evaluate(options) -> int:
                 still = measure_motion(run.assembly.model, run.animate(track, 0.0), track)["speed"]
                 moving[name]["gain"] = moving[name]["speed"] / still if still > 0 else float("nan")
     else:
-        names = (options.motion,) if options.motion else scene.motions
+        names = (options.motion,) if options.motion else (scene.body.file,) if scene.moves_by_itself else scene.motions
         if not names:
             raise InputError("a motion is needed", field="--motion", mend="give the motion of the animation")
+        if scene.moves_by_itself and options.motion:
+            raise InputError("no motion expected: the body's frames are it", field="--motion", mend="leave it out")
         run = Run(assemble(scene.without_network()), {})
-        track = run.track(names[0])
+        track = run.assembly.track if names[0] == scene.body.file else run.track(names[0])
         look(run, names[0], track, read_animation_over(target, run.assembly.model, track))
     if options.json:
         frames = {n: {k: v.tolist() for k, v in r.items()} for n, r in rows.items()}

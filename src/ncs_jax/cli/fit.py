@@ -110,7 +110,10 @@ def fit(options) -> int:
     else:
         file.write_text(text)
         name, run = shlex.quote(str(file)), shlex.quote(f"runs/{out.stem}")
-        print(f"wrote {file}, a scene to train:\n\n{text}\nnext: ncs check {name}, then ncs train {name} --out {run} --preview")
+        use, after = "train", f"ncs train {name} --out {run} --preview"
+        if body.frames is not None:
+            use, after = "simulate", f"ncs simulate {name} --out {shlex.quote(out.stem)}.glb --body"
+        print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: ncs check {name}, then {after}")
     return 0
 
 
@@ -227,12 +230,16 @@ def _scene(options, out: Path, found, body) -> str:
     from ncs_jax.prepare.joint_names import anatomy
     from ncs_jax.prepare.retarget import body_names, called
 
-    names = body_names(body)
+    names = () if body.frames is not None else body_names(body)
     moved = names and anatomy(called(names, body.bones), body.parents).roles.keys() >= LIMBS
     lines = [arguments.body_table(options, out.parent), "", "[garment]", f"file = {json.dumps(out.name)}"]
     lines += [f'pins = "{PINS}"'] if PINS in found.garment.groups else []
     lines += ["", "[motion]"]
-    if moved:
+    if body.frames is not None:
+        if not body.fps > 0:
+            lines.insert(1, "# fps = 30  # frames per second of the body, which its file does not say: state it")
+        lines += ["fps = 30  # of the physics; the body's frames are its motion"]
+    elif moved:
         lines += [f"files = {json.dumps([f'ncs:{name}' for name in MOTIONS])}", 'validation = ["ncs:mixed"]', "fps = 30"]
     else:
         lines += [
@@ -242,5 +249,6 @@ def _scene(options, out: Path, found, body) -> str:
     told = [f"{n} = {getattr(contact, n):g}" for n in ("thickness", "stiffness") if getattr(contact, n) != getattr(usual, n)]
     told = [f"{told[0]}  # for edges of {1000 * contact.edge:.0f} mm, else skin shows between them", *told[1:]] if told else []
     lines += ["", "[physics.collision]", *told] if told else []
-    lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]
+    if body.frames is None:
+        lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]
     return "\n".join(lines) + "\n"

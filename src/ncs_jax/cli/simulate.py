@@ -24,6 +24,7 @@ def add_commands(commands) -> None:
         "--out", required=True, metavar="FILE",
         help=f"{arguments.FORMATS}; an interrupted simulation goes on from FILE.partial.npz",
     )  # fmt: skip
+    parser.add_argument("--body", action="store_true", help="write the body too, into a .glb")
 
 
 def simulate(options) -> int:
@@ -36,7 +37,7 @@ def simulate(options) -> int:
     from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs import simulate as runs_simulate
 
-    suffix = animation_suffix(options.out)  # before hours are spent on frames that cannot be written
+    suffix = animation_suffix(options.out, with_body=options.body)  # before hours are spent on frames that cannot be written
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
     with WorkProgress("reading the scene") as progress:
 
@@ -50,7 +51,9 @@ def simulate(options) -> int:
         result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment
     names, x, fps = arguments.mesh_names(scene), result.vertices, result.fps
-    io.write_animation(options.out, x, garment.faces, fps, rest=garment.vertices, uv=garment.uv, names=names)
+    worn_by = result.wearer() if options.body else None
+    more = {"rest": garment.vertices, "uv": garment.uv}
+    io.write_animation(options.out, x, garment.faces, fps, **more, worn_by=worn_by, names=names)
     partial.unlink(missing_ok=True)
     print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
     if suffix in (".pc2", ".mdd"):

@@ -1,10 +1,10 @@
-"""Which triangles of a mesh others pass through, on the host: exact, and nothing is compiled."""
+"""Which triangles pass through each other, on the host: exact, and nothing is compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["crossed"]
+__all__ = ["crossed", "crossing_pairs"]
 
 PIECE = 200_000  # pairs of triangles that are looked at together, which bounds the memory
 
@@ -12,7 +12,16 @@ PIECE = 200_000  # pairs of triangles that are looked at together, which bounds 
 def crossed(
     x: np.ndarray, faces: np.ndarray, others: np.ndarray | None = None, other_faces: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return which triangles of a mesh (F,) a triangle of another mesh passes through; or of the same one, but for neighbours.
+    """Return which triangles of a mesh (F,) another one passes through, by the arguments and the rule of `crossing_pairs`."""
+    pairs, found = crossing_pairs(x, faces, others, other_faces), np.zeros(len(faces), bool)
+    found[pairs if others is None else pairs[:, 0]] = True
+    return found
+
+
+def crossing_pairs(
+    x: np.ndarray, faces: np.ndarray, others: np.ndarray | None = None, other_faces: np.ndarray | None = None
+) -> np.ndarray:
+    """Return pairs of triangles (N, 2), each once, that pass through each other: of two meshes, or of one, but for neighbours.
 
     Two triangles pass through each other where an edge of one goes through the inside of the other. An edge p q goes through a
     triangle a b c where p and q lie on different sides of its plane, and p q on one side of all three edges,
@@ -30,17 +39,13 @@ def crossed(
     x, alone = np.asarray(x, np.float64), others is None or other_faces is None
     y, second = (x, faces) if others is None or other_faces is None else (np.asarray(others, np.float64), other_faces)
     first, last = x[faces], y[second]
-    found = np.zeros(len(faces), bool)
     i, j = _near(first, last)
     if alone:
         apart = (i < j) & ~(faces[i][:, :, None] == faces[j][:, None, :]).any(axis=(1, 2))
         i, j = i[apart], j[apart]
-    for some in np.array_split(np.arange(len(i)), -(-len(i) // PIECE) or 1):
-        hit = _through(first[i[some]], last[j[some]])
-        found[i[some[hit]]] = True
-        if alone:
-            found[j[some[hit]]] = True
-    return found
+    some = np.array_split(np.arange(len(i)), -(-len(i) // PIECE) or 1)
+    hit = np.concatenate([_through(first[i[part]], last[j[part]]) for part in some])
+    return np.stack([i[hit], j[hit]], axis=1)
 
 
 def _near(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from ncs_jax.io.animation.animation import read_animation, write_animation
 from ncs_jax.io.character.body import read_body
 from ncs_jax.io.character.motion import read_motion
+from ncs_jax.io.character.moving_body import is_moving_body, read_moving_body
 from ncs_jax.io.character.smpl_model import read_betas
 from ncs_jax.io.character.write_body import write_body
 from ncs_jax.io.mesh.garment import read_garment, write_garment
@@ -13,11 +14,13 @@ __all__ = [
     "BodyRecord",
     "GarmentRecord",
     "MotionRecord",
+    "is_moving_body",
     "read_animation",
     "read_betas",
     "read_body",
     "read_garment",
     "read_motion",
+    "read_moving_body",
     "write_animation",
     "write_body",
     "write_garment",

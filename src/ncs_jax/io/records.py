@@ -18,7 +18,7 @@ def shown_frames(frames: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class BodyRecord:
-    """A skinned character in its rest pose.
+    """A skinned character in its rest pose, or a moving mesh in its first frame.
 
     Attributes:
         vertices: (V, 3) rest positions, m. faces: (F, 3) int32. joints: (J, 3) global rest positions, m.
@@ -28,6 +28,8 @@ class BodyRecord:
             R_j - I of every joint but the root add to the vertices, before skinning; None: no correctives. bones: J names of
             a person's bones, "" for none, where the format says which joints they are; else none. notes: what was mended in
             the file.
+        frames: all vertices in all frames (T, V, 3), m, of a body that is a moving mesh instead of a character; else None.
+        carriers: (T, J, 3, 4) what takes each of its joints from rest, its first frame, to a frame; fps: frames per second.
     """
 
     vertices: np.ndarray
@@ -40,6 +42,9 @@ class BodyRecord:
     posedirs: np.ndarray | None = None
     bones: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    frames: np.ndarray | None = None
+    carriers: np.ndarray | None = None
+    fps: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

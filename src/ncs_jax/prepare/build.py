@@ -22,6 +22,7 @@ from ncs_jax.network.methods.swing import as_about_the_drape
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
+from ncs_jax.prepare.moving_body import frame_features
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.setting import Below, Setting, cell_of, set_up
@@ -132,7 +133,9 @@ def build(
     setting = set_up(scene, prepared=prepared, below=below, dtype=dtype, report=report)
     automatic, scene = scene.network.cell == "auto", setting.scene
     model, body, track, faces, training = setting.model, setting.body, None, None, None
-    if prepared is None:
+    if body is not None and body.frames is not None:
+        track, scene = frame_features(model, body, setting.prepared.part), scene.without_network()
+    elif prepared is None:
         training = training_motions(setting)
         track = training_features(training, model)
     prepared = setting.prepared

@@ -36,7 +36,7 @@ def model_from(files: SceneFiles, prepared: Prepared, dtype) -> Model:
     body_points = body_blend = None
     if collides and body is not None:
         body_points = jax.device_put(np.asarray(body.vertices[prepared.part], dtype))
-        body_blend = blend_from(body_weights[:, kept], dtype=dtype)
+        body_blend = blend_from(body_weights[:, kept], dtype=dtype) if body.frames is None else None
     keeps_apart = physics.self_contact.stiffness > 0
     pins, groups = jax.device_put(files.pins), groups_from(files.mesh) if keeps_apart else None
     return Model(

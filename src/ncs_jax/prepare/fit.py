@@ -10,17 +10,19 @@ import numpy as np
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import adjacency, topology, with_middles
 from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
+from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.covering import Cover, contact_for, sinking
-from ncs_jax.prepare.garment_checks import FAR
+from ncs_jax.prepare.garment_checks import FAR, check_apart
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 
-__all__ = ["PINS", "Fitted", "fit", "pins_of", "push_out", "settle"]
+__all__ = ["PINS", "Fitted", "bring_apart", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
+TRIES = 12  # of bringing cloth apart
 PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
 NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
 OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away from the body
@@ -59,15 +61,17 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
             None: what keeps the skin from showing between vertices, see `covering.contact_for`.
 
     Raises:
-        InputError: the place is in doubt, or the garment cannot be pushed out of the body there.
+        InputError: the place is in doubt, or the garment cannot be pushed out of the body there, or passes through itself.
     """
     placement.check(file)
     placed = placement.garment
     before = placed.vertices.astype(np.float64)
     contact = contact_for(before, placed.faces, sinking(before, placed.faces, body.vertices, body.faces), clearance)
     x = push_out(before, placed.faces, body, contact.thickness)
+    x = bring_apart(x, placed.faces, body, contact.thickness)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
+        check_apart(file, placed)  # what else would be told follows from it
         raise InputError(
             f"a garment around the body expected: {100 * placement.inside:.0f} % of it are inside the body, and to come out "
             f"some of it must move by {farthest:.2f} m or more", file=file, field="vertices",
@@ -75,6 +79,7 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
             mend="look at the picture; give it the pose and size of the body in a modeller, or another place with --move",
         )  # fmt: skip
     placed = replace(placed, vertices=x.astype(placed.vertices.dtype))
+    check_apart(file, placed)
     away = _away_from(body, placed.vertices)
     pins, carried = pins_of(placed, *away)
     groups = placed.groups if PINS in placed.groups or not len(pins) else {**placed.groups, PINS: pins}
@@ -124,6 +129,33 @@ def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
         held |= short > 0
         own = np.where(held[:, None], moved + short[:, None] * away[: len(x)], 0)
     return x + moved
+
+
+def bring_apart(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
+    """Return vertices (V, 3) where cloth that passes through itself a little is smoothed until it does not.
+
+    Each of `TRIES` rounds moves the vertices of such triangles and the rings around them to the mean of their neighbours, and
+    then out of the body. Where none helps, whole parts are on each other's wrong side: it is returned as it was.
+    """
+    from scipy.sparse import diags_array
+
+    found = crossing_pairs(x, faces)
+    if not len(found):
+        return x
+    around = adjacency(topology(faces)[0], len(x))
+    mean, moved = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around, x
+    for _ in range(TRIES):
+        near = np.zeros(len(x))
+        near[faces[found]] = 1
+        for _ in range(RINGS // 2):
+            near = np.maximum(near, (around @ near) > 0)
+        for _ in range(RINGS // 2):
+            moved = np.where(near[:, None] > 0, mean @ moved, moved)
+        moved = push_out(moved, faces, body, clearance)
+        found = crossing_pairs(moved, faces)
+        if not len(found):
+            return moved
+    return x
 
 
 # --- pins -----------------------------------------------------------------------------------------------------------

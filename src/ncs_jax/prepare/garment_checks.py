@@ -9,11 +9,12 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.geometry.mesh import LINE, relative_heights
+from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["FAR", "UNITS", "Hole", "SurfaceSummary", "check_on_body", "distance_outside", "summarise_surface"]
+__all__ = ["FAR", "UNITS", "Hole", "SurfaceSummary", "check_apart", "check_on_body", "distance_outside", "summarise_surface"]
 
 UNITS = {
     0.01: "centimetres",
@@ -30,6 +31,7 @@ UNITS = {
 }  # metres a unit of a file, and its name
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
+NAMED = 2  # pairs of triangles that pass through each other
 SMALL = 0.12  # m: no head, hand or foot passes through a shorter opening,
 FEW, SHORT = 6, 0.25  # nor is one of so few edges meant that is so much shorter than the longest
 
@@ -55,6 +57,20 @@ class SurfaceSummary:
     components: int
     openings: tuple[Hole, ...]
     degenerate: int
+
+
+def check_apart(file: str | Path, garment: GarmentRecord) -> None:
+    """Raise an InputError where a garment passes through itself at rest: which triangles, and where."""
+    found = crossing_pairs(garment.vertices, garment.faces)
+    if not len(found):
+        return
+    middles = garment.vertices[garment.faces[found]].mean(axis=(1, 2))
+    places = [f"{a} and {b} at ({', '.join(f'{c:.2f}' for c in at)}) m" for (a, b), at in zip(found, middles, strict=True)]
+    raise InputError(
+        "a garment that does not pass through itself expected", file=file, field="faces",
+        value=f"{len(found)} pairs: {'; '.join(places[:NAMED])}",
+        mend="bring its layers apart there in a modeller; small folds ncs fit smooths by itself",
+    )  # fmt: skip
 
 
 def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:

@@ -11,6 +11,7 @@ from ncs_jax import io
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
+from ncs_jax.io.records import shown_frames
 from ncs_jax.prepare.contact_detail import bent_most, pieces_of, posed_skins
 from ncs_jax.prepare.skinning_weights import hung_weights, smooth_weights, transfer_weights, used_joints
 from ncs_jax.prepare.touchable import covered_by_layers, submesh, touchable_part
@@ -65,7 +66,8 @@ class Prepared:
 def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prepared:
     """Return what the files and the training motions of a scene tell, vibrations aside."""
     scene, body, garment = files.scene, files.body, files.garment
-    moves = any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in motions)
+    moves = body is not None and body.frames is not None and bool(np.any(body.frames != body.frames[:1]))
+    moves = moves or any(np.any(r.poses != r.poses[:1]) or np.any(r.translation != r.translation[:1]) for r in motions)
     basis = _smooth_modes(files)
     if body is None:
         alone = np.ones((len(garment.vertices), 1), np.float32)
@@ -81,7 +83,7 @@ def prepare_scene(files: SceneFiles, motions: Sequence[io.MotionRecord]) -> Prep
         if files.layers:
             part = part[~covered_by_layers(body, files.layers)[part]]
     wanted = used_joints(body.parents.tolist(), np.concatenate([weights, body.weights[part]]))
-    if moves:  # a joint that never turns tells the network nothing
+    if moves and motions:  # a joint that never turns tells the network nothing
         turning = np.any([np.any(r.poses != r.poses[:1], axis=(0, 2)) for r in motions], axis=0)
         wanted = tuple(j for j in wanted if turning[j] or body.parents[j] < 0)
     inputs = _input_joints(scene, body, wanted)
@@ -95,11 +97,19 @@ def _pieces(files: SceneFiles, part: np.ndarray, motions: Sequence[io.MotionReco
     if collision.points != "auto":
         pieces = np.full(len(garment.faces), 1 + int(collision.points), np.int8)
     else:
-        poses = [bent_most(record.poses) for record in motions]
-        bent = bent_most(np.concatenate(poses)) if poses else np.zeros((0, len(body.parents), 3))
         faces = submesh(body.faces, part, len(body.vertices))
-        pieces = pieces_of(garment.vertices, garment.faces, posed_skins(body, part, bent), faces, collision.thickness)
+        skins = _skins(body, part, motions)
+        pieces = pieces_of(garment.vertices, garment.faces, skins, faces, collision.thickness)
     return pieces if (pieces > 1).any() else pieces[:0]
+
+
+def _skins(body: io.BodyRecord, part: np.ndarray, motions: Sequence[io.MotionRecord]) -> list[np.ndarray]:
+    """Return a part of the body at rest, then as it is bent in the motions, (V, 3) each, m."""
+    if body.frames is not None:
+        return [frame[part] for frame in body.frames[shown_frames(len(body.frames))]]
+    poses = [bent_most(record.poses) for record in motions]
+    bent = bent_most(np.concatenate(poses)) if poses else np.zeros((0, len(body.parents), 3))
+    return posed_skins(body, part, bent)
 
 
 def _smooth_modes(files: SceneFiles) -> np.ndarray:

@@ -14,14 +14,15 @@ import numpy as np
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights
-from ncs_jax.io import MotionRecord
+from ncs_jax.geometry.triangle_crossings import crossing_pairs
+from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
 from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
 from ncs_jax.prepare.setting import RECURRENT, Setting
-from ncs_jax.prepare.speed_checks import speed_faults
+from ncs_jax.prepare.speed_checks import frame_jumps, speed_faults
 from ncs_jax.prepare.touchable import touchable_faces
 from ncs_jax.scene.model import Model, resting_body
 from ncs_jax.scene.spec import Scene
@@ -106,6 +107,9 @@ def _mesh(a: Setting) -> Iterator[Risk]:
     count = int((slim[slim > LINE] < RANGES["height of a triangle"][0]).sum())
     shown = f"{worst:.1e} of its longest edge, {count} such"
     yield from _outside("height of a triangle", worst, shown, "its strain is lost in rounding", clean)
+    if len(through := crossing_pairs(x, faces)):
+        value = f"{len(through)} pairs of triangles, first {through[0, 0]} and {through[0, 1]}"
+        yield Risk("garment through itself at rest", value, "it stays so", "ncs fit smooths small folds, else bring it apart")
     twice = len(x) - len(np.unique(x, axis=0))
     if twice:
         yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
@@ -120,8 +124,15 @@ def _grain(a: Setting) -> Iterator[Risk]:
 
 
 def _depths(a: Setting, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m."""
+    """Return how deep in the body the garment is as the body alone carries it (poses, verts), m.
+
+    poses: axis-angle (poses, joints, 3); of a moving mesh, the numbers of frames (poses,).
+    """
     model, body = a.model, required(a.body, "body")
+    if body.frames is not None and body.carriers is not None:
+        rest = np.asarray(model.garment.mesh.rest, np.float64)
+        cloth = [carried(rest, model.blend, transforms) for transforms in body.carriers[poses][:, list(model.source_joints)]]
+        return depths_on_host(np.stack(cloth), body.frames[poses][:, a.prepared.part], faces, layered=False)
     rest, skin = (np.asarray(x, np.float64) for x in (model.garment.mesh.rest, required(model.body, "model.body")))
     cloths, bodies = [], []
     for pose, transforms in zip(poses, joint_transforms(body, poses)[:, list(model.source_joints)], strict=True):
@@ -199,6 +210,17 @@ def _inside_in(a: Setting, faces: np.ndarray, say: Callable[[str], None]) -> Ite
             yield replace(risk, motion=name)
 
 
+def _in_frames(a: Setting, body: BodyRecord, faces: np.ndarray) -> Iterator[Risk]:
+    """Yield the risks of a moving mesh: what jumps, and cloth inside it in `POSES` of its frames as it alone carries it."""
+    if body.frames is None:
+        return
+    yield from (Risk(*fault) for fault in frame_jumps(a))
+    some = np.unique(np.linspace(0, len(body.frames) - 1, POSES).astype(int))
+    yield from _inside(
+        a, faces, some, "where that alone carries it", (DEEP, MANY), "clear the mesh of itself where it was made"
+    )
+
+
 def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
     """Yield a risk for each limb, spine or head of the body that no joint of a motion drives."""
     for limb, mend in record.undriven.items():
@@ -246,6 +268,8 @@ def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[
     if faces is not None and body is not None:
         below = "give it room over the garment below where it was made, or fit it with a larger ncs fit --clearance"
         mend = below if a.model.under else "push it out: ncs fit"
-        found += _inside(a, faces, np.zeros((1, len(body.parents), 3)), "at rest", (0.0, 0.0), mend)
+        rest = np.zeros((1, len(body.parents), 3)) if body.frames is None else np.zeros(1, int)
+        found += _inside(a, faces, rest, "at rest", (0.0, 0.0), mend)
+        found += _in_frames(a, body, faces)
     found += [risk for name in a.motions for risk in _far(a, name)]
     return found if faces is None else [*found, *_inside_in(a, faces, say)]

@@ -19,6 +19,7 @@ from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.prepare.constants import model_from
 from ncs_jax.prepare.garment_checks import check_on_body
 from ncs_jax.prepare.motion_import import load_motions
+from ncs_jax.prepare.moving_body import check_character, moving_body
 from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
 from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.scene.model import Layer, Model
@@ -130,7 +131,10 @@ def _betas(scene: Scene) -> np.ndarray:
 def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> SceneFiles:
     """Read the files of a scene but for its motions, and check that they fit together."""
     body, person, spec = None, scene.body, scene.garment
-    if person.file not in ("", "none"):
+    if scene.moves_by_itself:
+        body = moving_body(scene)
+    elif person.file not in ("", "none"):
+        check_character(scene)
         body = io.read_body(
             scene.path(person.file),
             betas=betas.tolist(),
@@ -150,8 +154,15 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
 
 
 def _check_body(file: Path, body: io.BodyRecord) -> None:
-    """Raise an InputError unless the body has the size of a character in metres."""
+    """Raise an InputError unless the body has the size of a character in metres, or about that, of a moving mesh."""
     height = np.ptp(body.vertices, axis=0).max()
+    if body.frames is not None:
+        if not 0.03 < height < 50:
+            raise InputError(
+                "a body in metres expected, 0.03 to 50 m", file=file, field="vertices", value=f"{height:.3g} m",
+                mend="state its unit: scale = 0.01 below [body] for centimetres, 0.001 for millimetres",
+            )  # fmt: skip
+        return
     if not 0.3 < height < 5:
         raise InputError(
             "a body in metres expected, 0.3 to 5 m tall", file=file, field="vertices", value=f"{height:.3g} m",

@@ -15,7 +15,7 @@ from ncs_jax.prepare.posing import joint_transforms, world_axes
 from ncs_jax.prepare.setting import Setting
 from ncs_jax.scene.motion_names import split_frames
 
-__all__ = ["frames_named", "good_stretches", "speed_faults", "thrown"]
+__all__ = ["frame_jumps", "frames_named", "good_stretches", "speed_faults", "thrown"]
 
 JUMP = 0.3  # m by which the root or skin may leave its path within a frame: the thickness of a limb
 TURN = 90.0  # degrees within a frame
@@ -142,6 +142,17 @@ def _turns(a: Setting, name: str, record: MotionRecord) -> _Fault | None:
     size = np.concatenate([[0], turn.max(axis=1)])
     value = f"{turn.max():.0f} degrees in {name}, {frames_named(size, TURN, record.origin)}, joint {label}"
     return _Fault(size > TURN, ("turn within a frame", value, "a limb passes through cloth", "clean or cut the motion there"))
+
+
+def frame_jumps(a: Setting) -> Iterator[tuple[str, str, str, str]]:
+    """Yield what of a moving mesh leaves its path within a frame, as `speed_faults` does of a motion."""
+    frames = required(required(a.body, "body").frames, "body.frames")
+    path = frames[:, _some(frames.shape[1])].astype(np.float64)
+    begun = np.concatenate([path[:1], path[:1], path])
+    away = np.linalg.norm(begun[2:] - 2 * begun[1:-1] + begun[:-2], axis=-1).max(axis=1)
+    if away.max() > JUMP:
+        value = f"{away.max():.2f} m, {frames_named(away, JUMP)} at {a.model.fps:g} per second"
+        yield "jump of the body within a frame", value, "the cloth is left behind, then torn along", "mend the frames there"
 
 
 def _some(count: int) -> np.ndarray:

@@ -18,15 +18,23 @@ from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest, resting_body
 
 __all__ = ["covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
+FRAMES = 60  # poses that are looked at, at most
+
 
 def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, poses: np.ndarray, reach: float) -> np.ndarray:
     """Return which body vertices (body,) come within `reach` (m) of the skinned rest garment in any of the given poses.
 
-    `poses` are axis-angle (frames, joints, 3). The rest pose is always checked too.
+    `poses` are axis-angle (frames, joints, 3). The rest pose is always checked too. Of a moving mesh its own frames are.
     """
     from scipy.spatial import cKDTree
 
-    near, body_blend = np.zeros(len(body.vertices), bool), blend_from(body.weights)
+    near = np.zeros(len(body.vertices), bool)
+    if body.frames is not None and body.carriers is not None:
+        for k in np.unique(np.linspace(0, len(body.frames) - 1, min(len(body.frames), FRAMES)).astype(int)):
+            cloth = carried(garment, garment_blend, body.carriers[k])
+            near |= np.isfinite(cKDTree(cloth).query(body.frames[k], distance_upper_bound=reach)[0])
+        return near
+    body_blend = blend_from(body.weights)
     more = None if body.posedirs is None else correctives_from(body.posedirs)
     for transforms in joint_transforms(body, np.concatenate([np.zeros((1, len(body.parents), 3)), poses])):
         cloth = carried(garment, garment_blend, transforms)
@@ -105,7 +113,7 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
     poses = np.concatenate([r.poses for r in records]) if records else np.zeros((0, len(body.parents), 3), np.float32)
-    some = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 60)).astype(int))] if len(poses) else poses
+    some = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), FRAMES)).astype(int))] if len(poses) else poses
     # A point of a triangle is at most its longest edge / sqrt(3) from a corner.
     corners = body.vertices[body.faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()

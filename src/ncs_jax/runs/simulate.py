@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
+from ncs_jax import io
 from ncs_jax.energies.inertia import out_of_balance
 from ncs_jax.energies.terms import OwnTerm, StepInputs
 from ncs_jax.energies.total import energy_terms
@@ -64,6 +65,21 @@ class Trajectory:
     seconds: np.ndarray
     fps: float
     assembly: Assembly
+    motion: io.MotionRecord | None = None  # of the body's joints at `fps`; None: the body has no joints, or stands still
+
+    def wearer(self) -> tuple[io.BodyRecord, io.MotionRecord] | io.AnimationRecord:
+        """Return the body as it moves, as `write_animation` takes it for a .glb.
+
+        Raises:
+            InputError: the scene has no body.
+        """
+        body, substeps = self.assembly.body, self.assembly.model.fps / self.fps
+        if body is None:
+            raise InputError("a scene with a body expected", file=self.assembly.scene.source, field="body.file", value="none")
+        if body.frames is not None:
+            return io.AnimationRecord(body.frames[:: round(substeps)].astype(np.float32), body.faces, self.fps)
+        still = np.zeros((len(self.vertices), len(body.parents), 3), np.float32)
+        return body, self.motion or io.MotionRecord(still, still[:, 0], self.fps)
 
 
 @jax.jit
@@ -194,7 +210,12 @@ def _simulated(
     arrays = {key: np.asarray(values) for key, values in rows.items()}
     if track.origin is not None:
         arrays["vertices"] += np.asarray(track.origin)[:: spec.substeps, None]
-    return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly)
+    return Trajectory(**arrays, fps=scene.motion.fps, assembly=assembly, motion=_every(records, spec.substeps))
+
+
+def _every(records: Sequence[io.MotionRecord], step: int) -> io.MotionRecord | None:
+    """Return the frames of a motion that have a garment, of every substep one; None where there is no motion."""
+    return next((replace(r, poses=r.poses[::step], translation=r.translation[::step], fps=r.fps / step) for r in records), None)
 
 
 KEPT = ("previous", "before", "unposed", "unposed_before")  # the state, beside how the last solve went

@@ -23,6 +23,7 @@ from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.metrics.coverage import TrainedMotion, trained_motion
 from ncs_jax.metrics.quality import summarise
 from ncs_jax.prepare.build import Assembly
+from ncs_jax.prepare.moving_body import refuse_training
 from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, read_trained, write_prepared, write_run, write_trained
 from ncs_jax.runs.log import Report, RunLog
@@ -72,6 +73,7 @@ def train(
         InputError: scene or folder are unusable, a run has more steps than it is to have, or `start` or the hosts do not fit.
     """
     scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
+    refuse_training(scene)
     out = None if out is None else Path(out)
     _check_options(steps, minutes, resume, start)
     facts = facts_of_run(out, resume, terms, network)

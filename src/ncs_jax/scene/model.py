@@ -73,9 +73,9 @@ class Model:
 
     `inputs` are the joints that the network reads, the root first. `body` and its `surface` are the part of the body that the
     garment can touch, `None` in a scene without a body or without collision; `correctives` are those of the part, `None` for a
-    body without. To the surface also belong the garments `under`
-    this one, after the body: each of their vertices goes by a transform of its own, which a track has after those of the
-    joints.
+    body without. Of a moving mesh `body` is the first frame and `body_blend` is None: a track has the places of its vertices
+    after the transforms of the joints. To the surface also belong the garments `under` this one, after the body: each of their
+    vertices goes by a transform of its own, which a track has after those of the joints.
     """
 
     skeleton: Skeleton
@@ -141,8 +141,11 @@ def resting_body(model: Model) -> np.ndarray:
 def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Float[Array, "body 3 *poses"]:
     """Return the touchable body in one frame or several, and the garments under this one, m.
 
-    A body is skinned linearly, after its pose correctives where it has some: see `skinning.corrected`.
+    A body is skinned linearly, after its pose correctives where it has some: see `skinning.corrected`. A moving mesh is
+    where its file says.
     """
+    if model.body_blend is None and model.body is not None:
+        return matrices[len(model.skeleton.parents) :, :, 3]
     lanes = (1,) * (matrices.ndim - 3)
     body, weights = required(model.body, "model.body"), required(model.body_blend, "model.body_blend")
     carried = blend(matrices, weights)

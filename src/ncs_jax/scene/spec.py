@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import math
 import tomllib
-import types
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,6 +15,7 @@ from typing import Any
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_lists import each_motion
 from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
+from ncs_jax.scene.parsing import checked_value, parse_table
 
 __all__ = [
     "PRESETS",
@@ -61,7 +60,7 @@ def _listed(names: tuple[str, ...] | str) -> tuple[str, ...]:
 class BodySpec:
     """[body]: the character."""
 
-    file: str = _f("ncs:body", "body file, ncs:NAME for a packaged one, or 'none' for a garment without a body")
+    file: str = _f("ncs:body", "body file, ncs:NAME for a packaged one, a mesh for each frame, or 'none' for no body")
     joints: tuple[str, ...] = _f((), "names or numbers of joints that the network reads; empty: those that move the garment")
     part: tuple[str, ...] | str = _f("auto", "auto: the garment touches what it can reach; all; or names of the meshes to read")
     betas: tuple[float, ...] | str = _f(
@@ -69,6 +68,10 @@ class BodySpec:
     )
     shapes: dict[str, float] = _f({}, "weights of blend shapes by name (glTF, FBX); others as in the file")
     correctives: bool = _f(True, "use the pose correctives of an SMPL model that has some")
+    fps: float = _f(0.0, "of a mesh for each frame: frames per second; 0: as the file says", low=0, high=1e6)
+    scale: float = _f(0.0, "of a mesh for each frame: metres a unit, 0.01 for cm; 0: as the file says, else 1", low=0, high=1e6)
+    up: str = _f("", "of a mesh for each frame: the axis that is up; empty: as USD says, else y", choices=("", "x", "y", "z"))
+    mesh: str = _f("", "the faces of a .pc2 or .mdd: a mesh file of the same vertices")
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -254,6 +257,13 @@ class Scene:
         return self.path(file), dataclasses.replace(self.motion, **own)
 
     @property
+    def moves_by_itself(self) -> bool:
+        """Tell whether the body is a mesh for each frame, which needs no motion: see `io.read_moving_body`."""
+        from ncs_jax.io.character.moving_body import is_moving_body
+
+        return self.body.file not in ("", "none") and is_moving_body(self.path(self.body.file))
+
+    @property
     def motions(self) -> tuple[str, ...]:
         """Return the names of all motions, those to train on first."""
         return (*self.motion.files, *self.motion.validation)
@@ -270,7 +280,7 @@ class Scene:
         def absolute(name):
             return name if name.startswith("ncs:") or name in ("", "none") else str(self.path(name).resolve())
 
-        tables["body"]["file"] = absolute(tables["body"]["file"])
+        tables["body"] |= {name: absolute(tables["body"][name]) for name in ("file", "mesh")}
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
         tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
         own, _ = tables["motion"].pop("own"), tables["motion"].pop("found")
@@ -338,10 +348,12 @@ def scene_from(tables: dict, source: str = "") -> Scene:
     if isinstance(motion := tables.get("motion"), dict):
         kinds, fields = typing.get_type_hints(MotionSpec), {f.name: f.metadata for f in dataclasses.fields(MotionSpec)}
         each = tuple(name for name, meta in fields.items() if meta.get("each"))
-        check = lambda name, value, where: _value(kinds[name], value, fields[name], source or "scene", where)  # noqa: E731
+        check = lambda name, value, where: checked_value(kinds[name], value, fields[name], source or "scene", where)  # noqa: E731
         motion, own = named_motions(motion, source or "scene", check, each)
         tables = {**tables, "motion": motion}
-    scene = _parse(Scene, tables, source or "scene", "")
+    scene = dataclasses.replace(parse_table(Scene, tables, source or "scene", ""), source=source)
+    if "files" not in tables.get("motion", {}) and scene.moves_by_itself:
+        scene = dataclasses.replace(scene, motion=dataclasses.replace(scene.motion, files=()))
     gravity = scene.physics.gravity
     if len(gravity) != 3:
         raise InputError("three numbers expected", file=source, field="physics.gravity", value=list(gravity))
@@ -354,7 +366,6 @@ def scene_from(tables: dict, source: str = "") -> Scene:
         raise InputError("an even last size expected", file=source, field="network.static", value=list(scene.network.static))
     if scene.garment.file in ("", "none"):
         raise InputError("a garment is needed", file=source, field="garment.file", value=scene.garment.file)
-    scene = dataclasses.replace(scene, source=source)
     found = each_motion({key: getattr(scene.motion, key) for key in LISTS}, own, scene.path, source)
     motion = dataclasses.replace(scene.motion, files=found.files, validation=found.validation, own=found.own, found=found.told)
     return dataclasses.replace(scene, motion=motion)
@@ -383,64 +394,3 @@ def _tables(spec, where: str) -> Iterator[str]:
             yield f"{text:36} # {note}"
     for f in nested:
         yield from _tables(getattr(spec, f.name), f"{where}.{f.name}".lstrip("."))
-
-
-def _parse(cls, tables, source: str, where: str):
-    """Return a dataclass from a table: every key must be a field, every value of its type and in its range."""
-    if not isinstance(tables, dict):
-        raise InputError("a table expected", file=source, field=where, value=tables, mend=f"write [{where}] and its fields")
-    hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
-    for key in tables:
-        if key not in fields:
-            near = next(iter(difflib.get_close_matches(key, list(fields), n=1)), "")
-            mend = f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}"
-            raise InputError("unknown key", file=source, field=f"{where}.{key}".lstrip("."), value=tables[key], mend=mend)
-    values = {}
-    for name, f in fields.items():
-        if name in tables:
-            values[name] = _value(hints[name], tables[name], f.metadata, source, f"{where}.{name}".lstrip("."))
-    return cls(**values)
-
-
-def _value(kind, value, meta, source, where):
-    """Return a value as the type of its field, after a check of type, choices and range."""
-    if dataclasses.is_dataclass(kind):
-        return _parse(kind, value, source, where)
-    origin = typing.get_origin(kind)
-    if origin in (typing.Union, types.UnionType):
-        kinds = typing.get_args(kind)  # a list, or one word
-        word = isinstance(value, str)
-        meta = {**meta, "choices": meta["choices"] if word else ()}
-        return _value(str if word else next(k for k in kinds if k is not str), value, meta, source, where)
-    if origin is tuple:
-        if isinstance(value, str | int | float) and not isinstance(value, bool):
-            raise InputError("a list expected", file=source, field=where, value=value, mend=f"write [{value!r}]")
-        if not isinstance(value, list | tuple):
-            raise InputError("a list expected", file=source, field=where, value=value)
-        item = typing.get_args(kind)[0]
-        return tuple(_value(item, v, meta, source, f"{where}[{i}]") for i, v in enumerate(value))
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise InputError("a table expected", file=source, field=where, value=value, mend='write { "theirs" = "ours" }')
-        return {k: _value(typing.get_args(kind)[1], v, meta, source, f"{where}.{k}") for k, v in value.items()}
-    if kind is str and isinstance(value, int) and not isinstance(value, bool):
-        value = str(value)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    good = {
-        bool: isinstance(value, bool),
-        int: number and float(value).is_integer(),
-        float: number,
-        str: isinstance(value, str),
-    }
-    if not good[kind]:
-        names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-        raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value)
-    if meta["choices"] and value not in meta["choices"]:
-        raise InputError(f"one of {', '.join(meta['choices'])} expected", file=source, field=where, value=value)
-    if kind in (int, float):
-        low, high = meta["low"], meta["high"]
-        if not (low < value <= high if meta["above"] else low <= value <= high):
-            bounds = f"a number {'above' if meta['above'] else 'from'} {low:g} {'up ' if meta['above'] else ''}to {high:g}"
-            raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value)
-    return kind(value)

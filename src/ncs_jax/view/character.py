@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.errors import required
 from ncs_jax.geometry.rotations import axis_angle_to_matrix
 from ncs_jax.geometry.skinning import (
     Blend,
@@ -30,20 +31,27 @@ from ncs_jax.view.heading import trunk_axes, up_of
 __all__ = ["animation_of", "body_vertices", "posed_body"]
 
 
-def animation_of(assembly: Assembly, motion: io.MotionRecord, vertices: np.ndarray) -> Animation:
+def animation_of(assembly: Assembly, motion: io.MotionRecord | None, vertices: np.ndarray) -> Animation:
     """Return a garment as pictures and pages draw it, on the character that wears it.
 
         contact_sheet("sheet.png", animation_of(run.assembly, run.motion(name), run.animate(name)))
 
     Args:
-        assembly: of the garment, such as `run.assembly`. motion: that the garment was animated over.
+        assembly: of the garment, such as `run.assembly`. motion: that the garment was animated over; None
+            for a body that is a moving mesh.
         vertices: of the garment over the motion (frames, verts, 3), m.
 
     Raises:
         InputError: the vertices do not fit: see `Animation`.
     """
     up = up_of(assembly.scene.physics.gravity)
-    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, motion), up)
+    body = assembly.body
+    if body is not None and body.frames is not None:
+        every = max(1, round(len(body.frames) / len(vertices)))  # of the substeps
+        worn_on = PosedBody(body.frames[::every], body.faces)
+        return Animation(vertices, assembly.garment.faces, assembly.model.fps / every, worn_on, up)
+    given = required(motion, "motion", "give the one that the garment was animated over")
+    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, given), up)
 
 
 def posed_body(assembly: Assembly, motion: io.MotionRecord) -> PosedBody | None:

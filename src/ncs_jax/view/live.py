@@ -72,6 +72,11 @@ def animated_garment(target: str, scene: str | None = None, motion: str | None =
     if not is_scene and scene is None:
         raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
     loaded = load_scene(target if is_scene else str(scene))
+    if loaded.moves_by_itself:
+        mend = "ncs simulate SCENE --out FILE.glb --body writes both, for any viewer"
+        raise InputError(
+            "a character expected to be shown live", file=target, field="body.file", value=loaded.body.file, mend=mend
+        )
     run = Run(assemble(loaded.without_network()), {})
     motions = _motions(motion, loaded.motion)
     if is_scene:

@@ -1,4 +1,4 @@
-"""Animations to and from .npz, .h5, .pc2, .mdd and USD, and to .glb and a folder of .obj files."""
+"""Animations to and from .npz, .h5, .pc2, .mdd, USD and folders of .obj files, and to .glb."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ncs_jax.errors import InputError
 from ncs_jax.io.animation.glb import NAMES, write_glb
 from ncs_jax.io.animation.mdd import read_mdd, write_mdd
+from ncs_jax.io.animation.obj_folder import read_obj_folder
 from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
 from ncs_jax.io.mesh.usd import USD, check_installed, read_usd_animation, write_usd
@@ -35,7 +36,7 @@ def write_animation(
     *,
     rest: ArrayLike | None = None,
     uv: ArrayLike | None = None,
-    worn_by: tuple[BodyRecord, MotionRecord] | None = None,
+    worn_by: tuple[BodyRecord, MotionRecord] | AnimationRecord | None = None,
     names: tuple[str, str] = NAMES,
 ) -> None:
     """Write a moving mesh in the format of the suffix; the file or folder appears whole or not at all.
@@ -49,7 +50,7 @@ def write_animation(
         path: the file to write; missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
         rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. uv: (F, 3, 2) texture coordinates of the
             triangles' corners, which .glb, USD and .obj hold and the other formats leave out. worn_by: the body and its motion
-            of T frames, to be written into a .glb too. names: of the mesh and the body there.
+            of T frames, or a body that is a moving mesh, to be written into a .glb too. names: of the mesh and the body there.
 
     Raises:
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
@@ -124,11 +125,11 @@ def _write_folder(path: Path, vertices: np.ndarray, faces: str, fps: float) -> N
 
 
 def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: float | int | None = None) -> AnimationRecord:
-    """Read a moving mesh from .npz, .h5, .pc2, .mdd or USD.
+    """Read a moving mesh from .npz, .h5, .pc2, .mdd, USD or a folder of .obj, see `read_obj_folder`.
 
     Args:
-        path: the file. faces, fps: for a .pc2, which holds neither, and faces for an .mdd; without them there are no faces, and
-            fps is NaN.
+        path: the file or folder. faces, fps: for a .pc2, which holds neither, and faces for an .mdd; without them there are no
+            faces, and fps is NaN. A folder holds no fps, and with fps an .npz or .h5 needs none.
 
     Raises:
         InputError: the file cannot be read, its arrays do not fit together, or a number is not finite.
@@ -136,7 +137,9 @@ def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: flo
     suffix = Path(path).suffix.lower()
     triangles = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
     rate = np.nan if fps is None else float(fps)
-    if suffix == ".pc2":
+    if suffix not in FORMATS and Path(path).expanduser().is_dir():
+        file, x, triangles = read_obj_folder(path)
+    elif suffix == ".pc2":
         file, x = read_pc2(path)
     elif suffix == ".mdd":
         file, x, rate = read_mdd(path)
@@ -144,7 +147,8 @@ def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: flo
         file, x, triangles, rate = read_usd_animation(path)
     elif suffix in READABLE:
         table = (read_npz if suffix == ".npz" else read_hdf5)(path, FIELDS.__contains__)
-        file, x, triangles, rate = table.file, table.array("vertices"), table.array("faces"), table.number("fps")
+        file, x, triangles = table.file, table.array("vertices"), table.array("faces")
+        rate = table.number("fps") if fps is None or "fps" in table else rate
     else:
         mend = "write it as one of these too" if suffix in FORMATS else "convert it"
         raise InputError(f"one of {', '.join(READABLE)} expected", file=path, value=suffix or "no suffix", mend=mend)

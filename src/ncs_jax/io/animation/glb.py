@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.weld import distinct
-from ncs_jax.io.records import BodyRecord, MotionRecord
+from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 
 __all__ = ["NAMES", "write_glb", "write_glb_body"]
@@ -36,7 +36,7 @@ def write_glb(
     fps: float,
     *,
     uv: np.ndarray | None = None,
-    worn_by: tuple[BodyRecord, MotionRecord] | None = None,
+    worn_by: tuple[BodyRecord, MotionRecord] | AnimationRecord | None = None,
     names: tuple[str, str] = NAMES,
 ) -> None:
     """Write a moving mesh that plays in any viewer of glTF; the file appears whole or not at all.
@@ -53,8 +53,8 @@ def write_glb(
 
     Args:
         path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
-        uv: (F, 3, 2) texture coordinates of corners, v upward. worn_by: the body and its motion of T frames.
-            names: of the moving mesh and of the body, as a modeller lists them.
+        uv: (F, 3, 2) texture coordinates of corners, v upward. worn_by: the body and its motion of T frames; or a body that is
+            a moving mesh, which is written as the garment is. names: of the garment and the body, as a modeller lists them.
 
     Raises:
         InputError: the file would be larger than 4 GiB, which the format cannot count, or it cannot be written.
@@ -62,7 +62,9 @@ def write_glb(
     split = _split(vertices.shape[1], faces, uv)
     frames, count = len(vertices), len(split.vertex)
     size = 24 * frames * count + 4 * frames * frames + 4 * faces.size + DESCRIPTION * frames
-    if worn_by is not None:
+    if isinstance(worn_by, AnimationRecord):
+        size += 24 * worn_by.vertices.size // 3 + 4 * frames * frames + 4 * worn_by.faces.size + DESCRIPTION * frames
+    elif worn_by is not None:
         body, motion = worn_by
         size += 88 * len(body.vertices) + 4 * body.faces.size + 16 * motion.poses.size + DESCRIPTION * len(body.joints)
     if size > LARGEST:
@@ -72,8 +74,11 @@ def write_glb(
         )  # fmt: skip
     document = _Document()
     keys = None if frames == 1 else document.array((np.arange(frames) / fps).astype("<f4")[:, None], bounded=True)
-    _garment(document, names[0], vertices, faces, split, keys)
-    if worn_by is not None:
+    _moving(document, names[0], vertices, faces, split, keys)
+    if isinstance(worn_by, AnimationRecord):
+        plain = _split(worn_by.vertices.shape[1], worn_by.faces, None)
+        _moving(document, names[1], worn_by.vertices, worn_by.faces, plain, keys, SKIN)
+    elif worn_by is not None:
         _body(document, names[1], *worn_by, keys)
     _write(path, document)
 
@@ -193,8 +198,16 @@ def _split(count: int, faces: np.ndarray, uv: np.ndarray | None) -> _Split:
     return _Split(source, own, place[number].reshape(-1, 3))
 
 
-def _garment(document: _Document, name: str, vertices: np.ndarray, faces: np.ndarray, split: _Split, keys: int | None) -> None:
-    """Add the garment: its mesh, a morph target for each later frame, and their weights over time."""
+def _moving(
+    document: _Document,
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    split: _Split,
+    keys: int | None,
+    color: tuple[float, ...] = CLOTH,
+) -> None:
+    """Add a moving mesh: its shape, a morph target for each later frame, and their weights over time."""
     frames, count = len(vertices), len(split.vertex)
 
     def shapes() -> Iterator[np.ndarray]:
@@ -223,12 +236,12 @@ def _garment(document: _Document, name: str, vertices: np.ndarray, faces: np.nda
         attributes[0]["TEXCOORD_0"] = document.array(split.uv.astype("<f4"), target=VERTICES)
     primitive = {"attributes": attributes[0], "indices": document.corners(split.faces, count)}
     if keys is None:
-        document.mesh(name, primitive, CLOTH)
+        document.mesh(name, primitive, color)
         return
-    mesh = document.mesh(name, primitive | {"targets": attributes[1:]}, CLOTH)
+    mesh, node = document.mesh(name, primitive | {"targets": attributes[1:]}, color), document.roots[-1]
     mesh["extras"] = {"targetNames": [f"frame_{t:04}" for t in range(1, frames)]}
     number = frames * (frames - 1)
-    document.moved(0, "weights", keys, document.accessor(document.view(4 * number, weights), 0, FLOAT, number, "SCALAR"))
+    document.moved(node, "weights", keys, document.accessor(document.view(4 * number, weights), 0, FLOAT, number, "SCALAR"))
 
 
 def _body(document: _Document, name: str, body: BodyRecord, motion: MotionRecord, keys: int | None) -> None:

@@ -68,7 +68,9 @@ def read_body(
     if suffix in (".pkl", ".pickle"):
         raise pickle_refused(path)
     if suffix != ".npz":
-        skinless = "a mesh alone has no skin: give it a skeleton and weights" if suffix in MESHES else "convert it"
+        skinless = "convert it"
+        if suffix in MESHES:
+            skinless = "a mesh alone has no skin (ncs simulate takes one for each frame): give it a skeleton and weights"
         raise InputError(
             f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix",
             mend=f"{skinless}, as in Blender or Mixamo, and export .glb or .fbx",

@@ -23,7 +23,7 @@ from ncs_jax.io.records import GarmentRecord
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices, normalised_weights
 
-__all__ = ["read_garment", "write_garment"]
+__all__ = ["raw_mesh", "read_garment", "write_garment"]
 
 GROUP = "group_"
 WEIGHTS = "blend_weights"
@@ -63,7 +63,7 @@ def read_garment(
             does not exist, a number that is not finite, a triangle with a vertex twice, an edge of more than two triangles,
             neighbours that face opposite sides (with turn_faces: a surface of one side), or a vertex in no triangle.
     """
-    raw = _raw(resolved(path), (mesh,) if isinstance(mesh, str) else tuple(mesh))
+    raw = raw_mesh(resolved(path), (mesh,) if isinstance(mesh, str) else tuple(mesh))
     file, verts = raw.file, len(raw.vertices)
     x = floats(file, "vertices", raw.vertices, ("V", 3), ("vertex",))
     faces = corners = indices(file, "faces", raw.faces, ("F", 3), verts, "vertices")
@@ -91,7 +91,7 @@ def read_garment(
     return GarmentRecord(x, faces, uv, sets, unit, axis, verts - len(x), weights, raw.joint_names, notes)
 
 
-def _raw(path: str | Path, mesh: tuple[str, ...]) -> RawGarment:
+def raw_mesh(path: str | Path, mesh: tuple[str, ...]) -> RawGarment:
     """Return what the reader of a file's format finds."""
     suffix = Path(path).suffix.lower()
     if suffix in OBJECTS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,22 @@ from ncs_jax.io.mesh.raw import RawGarment
 from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.tables.files import text_of
 
-__all__ = ["format_obj", "obj_faces", "read_obj"]
+__all__ = ["Polygons", "format_obj", "obj_faces", "polygons_of", "read_obj"]
+
+
+class Polygons(NamedTuple):
+    """What an .obj holds as it stands there, not checked: vertices (V, 3), texture coordinates (N, 2), and polygons by corner.
+
+    counts: (P,) corners of each polygon. corners: (sum of counts, 2) vertex and texture coordinate of each, -1 for none.
+    labels: of each polygon, the names of its object, groups and material.
+    """
+
+    file: Path
+    vertices: np.ndarray
+    coordinates: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    labels: list[tuple[str, str, str]]
 
 
 def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
@@ -27,6 +43,21 @@ def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         path: the file. mesh: names of objects (`o`), groups (`g`) or materials (`usemtl`) to read, with their vertices alone.
             None: the file must hold one object; its groups and materials are joined.
     """
+    file, x, coordinates, count, corner, labels = polygons_of(path)
+    chosen = _chosen(file, mesh, labels, np.repeat(np.arange(len(count)), count), corner[:, 0])
+    if not chosen.all():
+        corner, count = corner[np.repeat(chosen, count)], count[chosen]
+        used, corner[:, 0] = np.unique(corner[:, 0], return_inverse=True)
+        x = x[used]
+    vertex, coordinate = corner[triangle_corners(file, x, count, corner[:, 0])].reshape(-1, 3, 2).transpose(2, 0, 1)
+    none = int((coordinate < 0).any(axis=1).sum())
+    uv = coordinates[coordinate] if len(coordinates) and not none else None
+    notes = (f"{none} triangles have no texture coordinates, so none are kept",) if len(coordinates) and none else ()
+    return RawGarment(file, x, vertex.astype(np.int32), uv, notes=notes)
+
+
+def polygons_of(path: str | Path) -> Polygons:
+    """Read the lines of an .obj that are vertices, texture coordinates, polygons and names."""
     file, text = text_of(path)
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = []
@@ -48,18 +79,8 @@ def read_obj(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
             labels.append((names["o"], names["g"], names["usemtl"]))
         elif words[0] in names:
             names[words[0]] = " ".join(words[1:])
-    x, count = np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(counts, np.int64)
-    corner = np.array(corners, np.int64).reshape(-1, 2)
-    chosen = _chosen(file, mesh, labels, np.repeat(np.arange(len(count)), count), corner[:, 0])
-    if not chosen.all():
-        corner, count = corner[np.repeat(chosen, count)], count[chosen]
-        used, corner[:, 0] = np.unique(corner[:, 0], return_inverse=True)
-        x = x[used]
-    vertex, coordinate = corner[triangle_corners(file, x, count, corner[:, 0])].reshape(-1, 3, 2).transpose(2, 0, 1)
-    none = int((coordinate < 0).any(axis=1).sum())
-    uv = np.array(coordinates, np.float64)[coordinate] if coordinates and not none else None
-    notes = (f"{none} triangles have no texture coordinates, so none are kept",) if coordinates and none else ()
-    return RawGarment(file, x, vertex.astype(np.int32), uv, notes=notes)
+    x, uv = np.array(vertices, np.float64).reshape(-1, 3), np.array(coordinates, np.float64).reshape(-1, 2)
+    return Polygons(file, x, uv, np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2), labels)
 
 
 def _chosen(file: Path, mesh: Sequence[str], labels: list, owner: np.ndarray, corner: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.tables.files import readable, reading, replacing, unpackable
 from ncs_jax.io.tables.table import Table
 
-__all__ = ["read_npz", "write_npz"]
+__all__ = ["npz_shape", "read_npz", "write_npz"]
 
 HEADER = 10_000  # bytes; NumPy's own limit
 SUFFIX = ".npy"
@@ -29,15 +29,29 @@ def read_npz(path: str | Path, wanted: Callable[[str], bool]) -> Table:
         return Table(file, {n: _array(file, n, archive, m) for n, m in members.items() if wanted(n)}, tuple(members))
 
 
+def npz_shape(path: str | Path, name: str) -> tuple[int, ...]:
+    """Return the shape of an array without reading it; () where the file has none of that name, or cannot be read."""
+    try:
+        with zipfile.ZipFile(Path(path).expanduser()) as archive, archive.open(name + SUFFIX) as stream:
+            return _head(Path(path), name, stream)[0]
+    except Exception:  # whoever reads it says what is wrong
+        return ()
+
+
+def _head(file: Path, name: str, stream) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, order and type of the array that follows in a stream."""
+    major, _ = npy.read_magic(stream)
+    width = 2 if major == 1 else 4
+    size = int.from_bytes(stream.read(width), "little")
+    if size > HEADER:
+        raise InputError(f"a header of at most {HEADER} bytes expected", file=file, field=name, value=f"{size} bytes")
+    head = io.BytesIO(size.to_bytes(width, "little") + stream.read(size))
+    return (npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0)(head)
+
+
 def _array(file: Path, name: str, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as stream:
-        major, _ = npy.read_magic(stream)
-        width = 2 if major == 1 else 4
-        size = int.from_bytes(stream.read(width), "little")
-        if size > HEADER:
-            raise InputError(f"a header of at most {HEADER} bytes expected", file=file, field=name, value=f"{size} bytes")
-        head = io.BytesIO(size.to_bytes(width, "little") + stream.read(size))
-        shape, fortran, dtype = (npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0)(head)
+        shape, fortran, dtype = _head(file, name, stream)
         if dtype.kind not in "biufUS":
             raise InputError(
                 "plain numbers or text expected", file=file, field=name, value=f"dtype {dtype}",

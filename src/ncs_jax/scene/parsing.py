@@ -1,0 +1,73 @@
+"""Tables of a scene file to dataclasses: every key a field, every value of its type and in its range."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+
+from ncs_jax.errors import InputError
+
+__all__ = ["checked_value", "parse_table"]
+
+
+def parse_table(cls, tables, source: str, where: str):
+    """Return a dataclass from a table: every key must be a field, every value of its type and in its range."""
+    if not isinstance(tables, dict):
+        raise InputError("a table expected", file=source, field=where, value=tables, mend=f"write [{where}] and its fields")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
+    for key in tables:
+        if key not in fields:
+            near = next(iter(difflib.get_close_matches(key, list(fields), n=1)), "")
+            mend = f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}"
+            raise InputError("unknown key", file=source, field=f"{where}.{key}".lstrip("."), value=tables[key], mend=mend)
+    values = {}
+    for name, f in fields.items():
+        if name in tables:
+            values[name] = checked_value(hints[name], tables[name], f.metadata, source, f"{where}.{name}".lstrip("."))
+    return cls(**values)
+
+
+def checked_value(kind, value, meta, source, where):
+    """Return a value as the type of its field, after a check of type, choices and range."""
+    if dataclasses.is_dataclass(kind):
+        return parse_table(kind, value, source, where)
+    origin = typing.get_origin(kind)
+    if origin in (typing.Union, types.UnionType):
+        kinds = typing.get_args(kind)  # a list, or one word
+        word = isinstance(value, str)
+        meta = {**meta, "choices": meta["choices"] if word else ()}
+        return checked_value(str if word else next(k for k in kinds if k is not str), value, meta, source, where)
+    if origin is tuple:
+        if isinstance(value, str | int | float) and not isinstance(value, bool):
+            raise InputError("a list expected", file=source, field=where, value=value, mend=f"write [{value!r}]")
+        if not isinstance(value, list | tuple):
+            raise InputError("a list expected", file=source, field=where, value=value)
+        item = typing.get_args(kind)[0]
+        return tuple(checked_value(item, v, meta, source, f"{where}[{i}]") for i, v in enumerate(value))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise InputError("a table expected", file=source, field=where, value=value, mend='write { "theirs" = "ours" }')
+        return {k: checked_value(typing.get_args(kind)[1], v, meta, source, f"{where}.{k}") for k, v in value.items()}
+    if kind is str and isinstance(value, int) and not isinstance(value, bool):
+        value = str(value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    good = {
+        bool: isinstance(value, bool),
+        int: number and float(value).is_integer(),
+        float: number,
+        str: isinstance(value, str),
+    }
+    if not good[kind]:
+        names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+        raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value)
+    if meta["choices"] and value not in meta["choices"]:
+        raise InputError(f"one of {', '.join(meta['choices'])} expected", file=source, field=where, value=value)
+    if kind in (int, float):
+        low, high = meta["low"], meta["high"]
+        if not (low < value <= high if meta["above"] else low <= value <= high):
+            bounds = f"a number {'above' if meta['above'] else 'from'} {low:g} {'up ' if meta['above'] else ''}to {high:g}"
+            raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value)
+    return kind(value)
