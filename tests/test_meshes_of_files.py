@@ -300,6 +300,22 @@ def test_a_body_under_another_suffix(tmp_path):
             io.read_body(tmp_path / f"body{suffix}")
 
 
+@pytest.mark.parametrize("suffix", [".glb", ".vrm"])
+def test_gltf_that_was_renamed_is_read_as_what_it_is(tmp_path, suffix):
+    right = io.read_body(write_glb(tmp_path / "hero.glb"))
+    binary = (tmp_path / "hero.glb").read_bytes()
+    gltf = gl.GLTF2().load(str(tmp_path / "hero.glb"))
+    gltf.convert_buffers(gl.BufferFormat.DATAURI)
+    gltf.save_json(str(tmp_path / "text.gltf"))
+    (tmp_path / "binary.gltf").write_bytes(binary)
+    (tmp_path / f"text{suffix}").write_bytes(b"\xef\xbb\xbf " + (tmp_path / "text.gltf").read_bytes())
+    for name in ("text.gltf", "binary.gltf", f"text{suffix}"):
+        np.testing.assert_array_equal(io.read_body(tmp_path / name).vertices, right.vertices)
+    (tmp_path / f"page{suffix}").write_bytes(b"<!DOCTYPE html><html></html>")
+    with pytest.raises(InputError, match="begins with 'glTF' expected"):
+        io.read_body(tmp_path / f"page{suffix}")
+
+
 def test_packaged_files_have_their_short_names():
     assert len(io.read_body("ncs:body").vertices) == 6067
     assert len(io.read_garment("ncs:tshirt").vertices) and len(io.read_motion("ncs:walk").poses)
