@@ -262,6 +262,16 @@ def test_postures_that_nobody_holds_are_told(rng, body):
     assert "arms inside the trunk" in [f[0] for f in posture_faults(replace(right, poses=crossed), body, "y")]
 
 
+def test_inverse_rotations_are_told_by_their_knees(body):
+    """Matrices for rows in place of columns turn everything the other way: knees bend forward, in the frames that bend them."""
+    motion = walk()
+    motion = replace(motion, poses=1.8 * motion.poses)
+    inverse = replace(motion, poses=-motion.poses)
+    right, wrong = ([f for f in posture_faults(driven(m, body)[2], body, "y") if "knee" in f[0]] for m in (motion, inverse))
+    assert not right and [f[0] for f in wrong] == [f"the {side} knee bends forward" for side in ("left", "right")]
+    assert all("rotations are inverse" in f[2] for f in wrong)
+
+
 @pytest.mark.parametrize("degrees", [30, 60, 90])
 def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degrees):
     motion = walk()
