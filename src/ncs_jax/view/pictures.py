@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import cKDTree
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.tables.files import replacing
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
@@ -206,7 +207,8 @@ def contact_sheet(
         x = margin + (column + 0.5) * width
         below = labels[column] if labels else f"{frame / fps:.2f} s"
         draw.text((x, label + len(rows) * tile + 22), below, INK, _font(22), "mm")
-    sheet.save(path, optimize=True)
+    with replacing(path) as part:
+        sheet.save(part, optimize=True)
 
 
 def animation_gif(
@@ -271,4 +273,5 @@ def _write_gif(path, pictures, seconds, colours):
     # A GIF counts in hundredths of a second: the rounding must not add up.
     ends = np.maximum.accumulate(np.round(np.arange(1, len(drawn) + 1) * seconds * 100)).astype(int)
     durations = [max(20, int(d) * 10) for d in np.diff(ends, prepend=0)]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=durations, loop=0, optimize=False, disposal=1)
+    with replacing(path) as part:
+        drawn[0].save(part, save_all=True, append_images=drawn[1:], duration=durations, loop=0, optimize=False, disposal=1)
