@@ -188,7 +188,7 @@ def contact_sheet(
     tall = 1.10 * (high - low)
     wide = 1.10 * max(each[3] for row in bounds for each in row)
     width = round(tile * min(max(wide / tall, 0.40), 1.3))
-    margin, label = 56, 40
+    margin, label, fps = 56, 40, rows[0][2].animation.fps
     sheet = Image.new("RGB", (2 * margin + width * len(chosen), len(rows) * tile + 2 * label + margin), PAPER)
     draw = ImageDraw.Draw(sheet)
     for row, (name, _, stage) in enumerate(rows):
@@ -202,7 +202,6 @@ def contact_sheet(
         text = Image.new("L", (tile, label), 0)
         ImageDraw.Draw(text).text((tile / 2, label / 2), name.upper(), 255, _font(17), "mm")
         sheet.paste(FAINT, (8, top), text.rotate(90, expand=True))
-    fps = rows[0][2].animation.fps
     for column, frame in enumerate(chosen):
         x = margin + (column + 0.5) * width
         below = labels[column] if labels else f"{frame / fps:.2f} s"
