@@ -285,6 +285,27 @@ def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degree
         assert told and all(words in fault[0] and "motion.rest" in fault[3] for fault in told)
 
 
+@pytest.mark.parametrize(("parts", "axis", "degrees"), [
+    (("clavicle",), 2, 25), (("clavicle",), 2, -30), (("neck", "head"), 0, 40), (("neck", "head"), 0, -40),
+])  # fmt: skip
+def test_collars_or_a_head_alone_that_are_bent_in_the_zero_pose_are_told(body, parts, axis, degrees):
+    """Raised or lowered collars, a head that looks down or up in a T-pose that is good otherwise; not as frames are too."""
+    motion = walk()
+    turns = np.broadcast_to(np.eye(3), (len(motion.parents), 3, 3)).copy()
+    for j, (side, part) in enumerate(figure("mixamo")[3]):
+        if part in parts:
+            sign = -1 if axis == 2 and side == "right" else 1
+            turns[j] = Rotation.from_rotvec(sign * np.radians(degrees) * np.eye(3)[axis]).as_matrix()
+    given = told_since(motion, turns)
+    moved, name = driven(given, body)[2], "collars" if axis == 2 else "neck"
+    assert moved.uncertain[f"{name} of the zero pose"] > 15
+    (risk,) = _uncertain({"a.bvh": moved})
+    assert f"{name} " in risk.value and "a.bvh" in risk.value and "motion.rest" in risk.mend and "built" not in risk.what
+    asked = driven(given, body, rest="zero")[2], driven(motion, body)[2]
+    frames_too = driven(replace(motion, joints=given.joints), body)[2]
+    assert not any(record.uncertain for record in (*asked, frames_too))
+
+
 def turned_alone(motion: MotionRecord, part: str, side: str, turn: Rotation) -> MotionRecord:
     """The motion since a zero pose in which one joint alone is turned."""
     turns = np.broadcast_to(np.eye(3), (motion.poses.shape[1], 3, 3)).copy()
