@@ -416,6 +416,28 @@ def test_a_root_above_the_hips_and_bones_that_slide(tmp_path, body):
     assert "bones slide" in " ".join(found["slides"][2].notes) and "carries the path" in " ".join(found["still"][2].notes)
 
 
+def test_a_prop_that_slides_on_a_hand_is_left_out(tmp_path, body):
+    """With a note, and the rest moves as without it; a hand that slides is refused as before."""
+    motion = walk()
+    names, hand = list(motion.joint_names), [k[1] for k in figure("mixamo")[3]].index("hand")
+    joints, parents = np.asarray(motion.joints), np.asarray(motion.parents)
+    path = {names[0]: joints[0] + motion.translation}
+    with_prop = replace(
+        motion, poses=np.pad(motion.poses, ((0, 0), (0, 1), (0, 0))), joints=np.vstack([joints, joints[hand] + [0.1, 0, 0]]),
+        parents=np.append(parents, hand), joint_names=(*names, f"{names[hand]}Prop"),
+    )  # fmt: skip
+    slides = np.linspace(0.1, 0.4, FRAMES)[:, None] * [1, 0, 0]
+    (tmp_path / "plain.bvh").write_text(bvh_text(motion, path))
+    (tmp_path / "prop.bvh").write_text(bvh_text(with_prop, {**path, f"{names[hand]}Prop": slides}))
+    (tmp_path / "hand.bvh").write_text(bvh_text(motion, {**path, names[hand]: slides}))
+    plain, prop = (driven(io.read_motion(tmp_path / f"{n}.bvh"), body) for n in ("plain", "prop"))
+    angle, far = apart(plain, prop)
+    assert angle.max() < 1e-6 and far < 1e-9
+    assert f"left out, as they slide and carry nothing: {names[hand]}Prop" in " ".join(prop[2].notes)
+    with pytest.raises(InputError, match=f"joint {names[hand]}: bones of fixed length"):
+        io.read_motion(tmp_path / "hand.bvh")
+
+
 def test_hips_and_spine_beside_each_other(body):
     """A root carries a pelvis with the legs and, beside it, a waist with the spine, as Character Creator writes it."""
     motion = walk()

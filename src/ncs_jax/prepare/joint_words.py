@@ -223,4 +223,8 @@ def _side(parts: list[str]) -> tuple[str, list[str]]:
 def _is_limb(word: str) -> bool:
     """Tell whether a word is one of a limb, or begins with one and goes on as twists do."""
     helped = HELPER.sub("", word) or word
-    return word in TOES or (ROLES.get(_known(helped), "head") not in MIDDLE or _known(helped) in EITHER) or bool(FINGER.match(helped))
+    return (
+        word in TOES
+        or (ROLES.get(_known(helped), "head") not in MIDDLE or _known(helped) in EITHER)
+        or bool(FINGER.match(helped))
+    )
