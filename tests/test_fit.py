@@ -213,6 +213,10 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     assert main([*command, str(tmp_path / "fitted.npz"), "--stay"]) == 0
     told = capsys.readouterr().out
     assert "0.01 m a unit, Z up" in told and "0 inside now" in told and 'pins = "pins"' in told
+    beside = [*command, str(tmp_path / "beside.npz"), "--move", "0.5", "0", "0"]
+    assert main(beside) == 2 and not (tmp_path / "beside.npz").exists()
+    printed = capsys.readouterr()
+    assert "beside.png: the place that was given" in printed.out and "none of its openings" in printed.err
     assert (tmp_path / "fitted.png").read_bytes()[:4] == b"\x89PNG"
     written = io.read_garment(tmp_path / "fitted.npz")
     text = scene.read_text().replace('"cloth.npz"', '"fitted.npz"\npins = "pins"')
