@@ -322,6 +322,13 @@ HEAD: EYE_{G}
 SPINE_CHEST: CLAVICLE_{G}=c SHOULDER_{G}=a ELBOW_{G}=f WRIST_{G}=w HAND_{G} HANDTIP_{G}
 PELVIS: HIP_{G}=t KNEE_{G}=k ANKLE_{G}=o FOOT_{G}=e
 """,
+    "OpenPose": """
+MidHip=h Neck=n Nose=H
+Nose: {L}Eye {L}Ear
+Neck: {L}Shoulder=a {L}Elbow=f {L}Wrist=w
+MidHip: {L}Hip=t {L}Knee=k {L}Ankle=o {L}BigToe=e {L}SmallToe
+{L}Ankle: {L}Heel
+""",
     "Perception Neuron": """
 Hips=h Spine=s Spine1=s Spine2=s Neck=n Neck1=n Head=H
 Spine2: {S}Shoulder=c {S}Arm=a {S}ForeArm=f {S}Hand=w {S}InHandIndex {S}HandIndex1

@@ -229,6 +229,7 @@ def test_a_real_process_exits_with_2(tmp_path):
     ("arguments", "words"),
     [
         (["check", "nowhere.toml"], ["nowhere.toml", "no such scene"]),
+        (["check", "ncs:tshirt", "--out", "check.jpg2"], ["--out", "'check.jpg2'", ".png expected"]),
         (["check", "ncs:nothing"], ["ncs:nothing", "ncs:tshirt"]),
         (["animate", "nowhere", "--out", "a.npz"], ["nowhere", "run"]),
         (["evaluate", "nowhere"], ["nowhere"]),

@@ -151,6 +151,41 @@ def test_a_place_that_is_given_is_kept():
     assert found.options == "--scale 1 --up=y --move 0.000 -0.020 0.000"
 
 
+def sheet(side=0.3, height=1.005, count=9):
+    """A flat square, whose outside nothing tells, above the origin."""
+    x, z = np.meshgrid(*2 * [np.linspace(-side / 2, side / 2, count)], indexing="ij")
+    k = np.arange(count**2).reshape(count, count)
+    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    points = np.stack([x.ravel(), np.full(count**2, height), z.ravel()], axis=1)
+    return io.GarmentRecord(points, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]).astype(np.int32))
+
+
+@pytest.mark.parametrize(("given", "move"), [(sleeve(), (0.5, 0, 0)), (sheet(), (0.5, 0, 0)), (sheet(), (0, 0.4, 0))])
+def test_a_place_that_is_given_beside_the_body_is_refused(body, given, move):
+    """With the unit of its file, though in others it would touch: before, it was taken as it was said."""
+    with pytest.raises(InputError, match=r"none of its openings, and 0 % .*--scale 1 --up=y --move.*leave out --stay"):
+        place("g.obj", given, body, move=move).check("g.obj")
+
+
+def test_what_lies_on_the_body_at_a_given_place_is_kept_though_nothing_passes_through_it(body):
+    over = replace(sheet(), faces=sheet().faces[:, ::-1])
+    for given, aside, lies in ((sheet(), 0, True), (over, 0, True), (sheet(), 0.24, False), (over, 0.24, False)):
+        found = place("g.obj", given, body, move=(aside, 0, 0))
+        assert found.threaded == 0 and found.given and bool(found.doubt) != lies and bool(found.warning) == lies
+    found = place("g.obj", sleeve(0.075), body, move=(0, 0, 0))
+    assert found.threaded == 1 and not found.doubt and not found.warning
+
+
+def test_a_given_place_takes_no_guess_of_unit_and_axes_against_what_speaks_against_it():
+    """A skirt in inches 20 inches too low: in centimetres, upside down, the legs pass through some of it. Said, it is kept."""
+    body, skirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "skirt.npz")
+    inches = replace(skirt, vertices=skirt.vertices / 0.0254 + [0, 28, 0], weights=None)
+    with pytest.raises(InputError, match=r"unit and axes are not stated.*as they are guessed.*state unit and axes by --scale"):
+        place("g.obj", inches, body, move=(0, 0, 0)).check("g.obj")
+    found = place("g.obj", inches, body, move=(0, 0, 0), scale=0.0254, up="y")
+    assert (found.scale, found.up, found.doubt) == (0.0254, "y", "") and found.warning
+
+
 def test_what_nothing_carries_is_pinned_around_its_highest_hole(body):
     found = fit("g.npz", sleeve(0.1), body, move=(0, 0, 0)).garment
     top = found.vertices[:, 1].max()
@@ -178,6 +213,10 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     assert main([*command, str(tmp_path / "fitted.npz"), "--stay"]) == 0
     told = capsys.readouterr().out
     assert "0.01 m a unit, Z up" in told and "0 inside now" in told and 'pins = "pins"' in told
+    beside = [*command, str(tmp_path / "beside.npz"), "--move", "0.5", "0", "0"]
+    assert main(beside) == 2 and not (tmp_path / "beside.npz").exists()
+    printed = capsys.readouterr()
+    assert "beside.png: the place that was given" in printed.out and "none of its openings" in printed.err
     assert (tmp_path / "fitted.png").read_bytes()[:4] == b"\x89PNG"
     written = io.read_garment(tmp_path / "fitted.npz")
     text = scene.read_text().replace('"cloth.npz"', '"fitted.npz"\npins = "pins"')

@@ -362,6 +362,21 @@ def test_a_garment_that_nothing_brings_onto_the_body():
         check_on_body(Path("g.npz"), garment(grid()[0] * 1e5), body, axis_given=False)
 
 
+@pytest.mark.parametrize(("given", "words"), [
+    ({"scale_given": True, "axis_given": True}, "move it into the body's coordinates, or mend garment.up"),
+    ({"scale_given": True, "axis_given": False}, 'if its axes are others, write up = "x" below'),
+    ({"scale_given": False, "axis_given": True}, "it looks like centimetres: write scale = 0.01 below"),
+])  # fmt: skip
+def test_what_the_scene_states_is_not_guessed_at(given, words):
+    """A sheet in inches that is 0.3 m above the body, where one in cm would be on it; and one that X up would bring."""
+    x = grid()[0] @ np.array(TURNED["x"]) if 'up = "x"' in words else grid(rows=9)[0] + [0, 1.0, 0]
+    with pytest.raises(InputError) as caught:
+        check_on_body(Path("g.npz"), garment(x, scale=0.0254), post()["vertices"], **given)
+    told = str(caught.value)
+    assert words in told and "ncs fit" in told
+    assert not (given["scale_given"] and "scale =" in told) and not (given["axis_given"] and "up =" in told)
+
+
 def test_a_small_hole_is_told_from_openings():
     """A quad that is missing, 16 cm around, between openings of 2.2 m; a wrist of as many edges is no hole beside them."""
     x, faces = tube(36, 12, 0.35, 0.4)

@@ -285,6 +285,27 @@ def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degree
         assert told and all(words in fault[0] and "motion.rest" in fault[3] for fault in told)
 
 
+@pytest.mark.parametrize(("parts", "axis", "degrees"), [
+    (("clavicle",), 2, 25), (("clavicle",), 2, -30), (("neck", "head"), 0, 40), (("neck", "head"), 0, -40),
+])  # fmt: skip
+def test_collars_or_a_head_alone_that_are_bent_in_the_zero_pose_are_told(body, parts, axis, degrees):
+    """Raised or lowered collars, a head that looks down or up in a T-pose that is good otherwise; not as frames are too."""
+    motion = walk()
+    turns = np.broadcast_to(np.eye(3), (len(motion.parents), 3, 3)).copy()
+    for j, (side, part) in enumerate(figure("mixamo")[3]):
+        if part in parts:
+            sign = -1 if axis == 2 and side == "right" else 1
+            turns[j] = Rotation.from_rotvec(sign * np.radians(degrees) * np.eye(3)[axis]).as_matrix()
+    given = told_since(motion, turns)
+    moved, name = driven(given, body)[2], "collars" if axis == 2 else "neck"
+    assert moved.uncertain[f"{name} of the zero pose"] > 15
+    (risk,) = _uncertain({"a.bvh": moved})
+    assert f"{name} " in risk.value and "a.bvh" in risk.value and "motion.rest" in risk.mend and "built" not in risk.what
+    asked = driven(given, body, rest="zero")[2], driven(motion, body)[2]
+    frames_too = driven(replace(motion, joints=given.joints), body)[2]
+    assert not any(record.uncertain for record in (*asked, frames_too))
+
+
 def turned_alone(motion: MotionRecord, part: str, side: str, turn: Rotation) -> MotionRecord:
     """The motion since a zero pose in which one joint alone is turned."""
     turns = np.broadcast_to(np.eye(3), (motion.poses.shape[1], 3, 3)).copy()
@@ -393,6 +414,28 @@ def test_a_root_above_the_hips_and_bones_that_slide(tmp_path, body):
         angle, far = apart(found["plain"], one)
         assert angle.max() < 1e-3 and far < (0.002 if name == "slides" else 1e-5), name
     assert "bones slide" in " ".join(found["slides"][2].notes) and "carries the path" in " ".join(found["still"][2].notes)
+
+
+def test_a_prop_that_slides_on_a_hand_is_left_out(tmp_path, body):
+    """With a note, and the rest moves as without it; a hand that slides is refused as before."""
+    motion = walk()
+    names, hand = list(motion.joint_names), [k[1] for k in figure("mixamo")[3]].index("hand")
+    joints, parents = np.asarray(motion.joints), np.asarray(motion.parents)
+    path = {names[0]: joints[0] + motion.translation}
+    with_prop = replace(
+        motion, poses=np.pad(motion.poses, ((0, 0), (0, 1), (0, 0))), joints=np.vstack([joints, joints[hand] + [0.1, 0, 0]]),
+        parents=np.append(parents, hand), joint_names=(*names, f"{names[hand]}Prop"),
+    )  # fmt: skip
+    slides = np.linspace(0.1, 0.4, FRAMES)[:, None] * [1, 0, 0]
+    (tmp_path / "plain.bvh").write_text(bvh_text(motion, path))
+    (tmp_path / "prop.bvh").write_text(bvh_text(with_prop, {**path, f"{names[hand]}Prop": slides}))
+    (tmp_path / "hand.bvh").write_text(bvh_text(motion, {**path, names[hand]: slides}))
+    plain, prop = (driven(io.read_motion(tmp_path / f"{n}.bvh"), body) for n in ("plain", "prop"))
+    angle, far = apart(plain, prop)
+    assert angle.max() < 1e-6 and far < 1e-9
+    assert f"left out, as they slide and carry nothing: {names[hand]}Prop" in " ".join(prop[2].notes)
+    with pytest.raises(InputError, match=f"joint {names[hand]}: bones of fixed length"):
+        io.read_motion(tmp_path / "hand.bvh")
 
 
 def test_hips_and_spine_beside_each_other(body):

@@ -9,16 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ncs_jax.cli import main
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.scene_checks import RANGES, find_risks
-from ncs_jax.prepare.speed_checks import frames_named, good_stretches, thrown
+from ncs_jax.prepare.speed_checks import FLUNG, flung, frames_named, good_stretches, thrown
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
 
 from .scenes import SCENE, grid, swing, write_scene
 
+UP = np.array([0.0, 1.0, 0.0])
 RESULTS = Path(__file__).parents[1] / "experiments" / "results"
 SOUND = SCENE.replace("[network]", '[network]\nmethod = "pbns"')
 
@@ -180,3 +182,40 @@ def test_a_garment_is_thrown_as_its_pendulum_is(fps):
     assert abs(far.max() / expected - 1) < 6 / fps and not far[: fps // 6].any()
     upward = np.roll(path, 1, axis=2)
     assert not thrown(upward, np.ones(3), float(fps), np.array([0.0, -9.81, 0.0]), length, 0.0).any()
+    still = flung(path, np.ones(3), float(fps), np.array([0.0, -9.81, 0.0]), length, 0.0)
+    np.testing.assert_allclose(still, far, atol=1e-9)
+
+
+def turned_hem(angle, axis):
+    """A ring of 0.2 m radius, and one 0.5 m below it, turned about an axis through the upper one's middle."""
+    around = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = 0.2 * np.stack([np.cos(around), 0 * around, np.sin(around)], axis=1)
+    return np.einsum("tab,pb->tpa", Rotation.from_rotvec(angle[:, None] * np.eye(3)[axis]).as_matrix(), [*ring, *ring - UP / 2])
+
+
+def test_a_spin_flings_as_a_conical_pendulum_flies():
+    """r omega^2 / g, when the start has died down; at rest in the world, the same pendulum sees little of it."""
+    gravity, fps, turns = -9.81 * UP, 240, 3.0
+    path = turned_hem(2 * np.pi * turns * np.arange(8 * fps) / fps, 1)
+    far = flung(path, np.ones(24), float(fps), gravity, 0.5, 2.0)
+    assert abs(far[-1] / (0.2 * (2 * np.pi * turns) ** 2 / 9.81) - 1) < 0.01
+    assert thrown(path, np.ones(24), float(fps), gravity, 0.5, 2.0)[-1] < 0.6
+
+
+def test_a_flip_flings_and_a_slow_roll_does_not():
+    gravity, time = -9.81 * UP, np.arange(120) / 30
+    far = [
+        flung(turned_hem(2 * np.pi * np.clip((time - 1) / length, 0, 1), 0), np.ones(24), 30.0, gravity, 0.5, 1.0).max()
+        for length in (0.4, 3.0)
+    ]
+    assert far[0] > FLUNG and far[1] < 1
+
+
+def test_a_spin_puts_a_swing_at_risk(tmp_path, plain_jax):
+    text = SCENE.replace('cell = "gated"', 'cell = "swing"')
+    for turns, told in ((5.0, True), (0.3, False)):
+        motion = swing(frames=90)
+        motion["poses"], motion["trans"] = 0 * motion["poses"], 0 * motion["trans"]
+        motion["poses"][:, 0, 1] = (2 * np.pi * turns * np.arange(90) / 30 + np.pi) % (2 * np.pi) - np.pi
+        values = [risk.value for risk in found(tmp_path, text, motion) if risk.what == "fast motion"]
+        assert bool(values) == told and all("flung off the turning body" in value for value in values)

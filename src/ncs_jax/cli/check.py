@@ -42,6 +42,8 @@ def check(options) -> int:
         return 0
     if options.scene is None:
         raise InputError("a scene file is needed", mend="give one, ncs:tshirt for the packaged one, or --fields")
+    if Path(options.out).suffix.lower() not in ("", ".png"):
+        raise InputError("a name that ends in .png expected", field="--out", value=options.out, mend="pictures are PNG")
     scene = load_scene(options.scene)  # before JAX is imported, which takes a second
 
     from ncs_jax.prepare.scene_checks import find_risks

@@ -124,7 +124,7 @@ def _drawn(picture: Path, body, placement) -> Iterator[None]:
         yield
     except InputError:
         _draw(picture, body, placement.garment.faces, {"refused": placement.garment.vertices})
-        print(f"wrote {picture}: the best place that was found")
+        print(f"wrote {picture}: " + ("the place that was given" if placement.given else "the best place that was found"))
         raise
 
 

@@ -102,7 +102,8 @@ class MotionRecord:
         origin: the number in its file of the first frame, and how many of the file's frames make one of these.
         driven: of a motion that was retargeted, the source's joint for each joint of the body that one drives.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
-        uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees.
+        uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees;
+            or "head of the zero pose", that is bent there as in no frame, and by how much.
     """
 
     poses: np.ndarray

@@ -93,17 +93,18 @@ def _openings(x: np.ndarray, loops: list[np.ndarray]) -> tuple[Hole, ...]:
     return tuple(sorted(found, key=lambda opening: -opening.height))
 
 
-def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_given: bool) -> None:
+def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_given: bool, scale_given: bool = False) -> None:
     """Raise an InputError unless a garment has about the size of the body, lies on it, and stands upright as it does.
 
     The message names the unit and the axis that would bring the garment onto the body, found by the boxes around both. They
     are not applied: a box cannot tell a garment in inches from a large one, and the whole training depends on them. A scene
-    file that states them means the same with every body.
+    file that states them means the same with every body. What the scene states is not guessed at.
 
     Args:
-        file: the garment's, for errors. garment: as read. body: vertices (V, 3), m. axis_given: the scene states the axis that
-            is up, so none is looked for.
+        file: the garment's, for errors. garment: as read. body: vertices (V, 3), m. axis_given, scale_given: the scene states
+            the axis that is up, the unit, so no other is looked for.
     """
+    told = scale_given, axis_given
     size, tall = np.ptp(garment.vertices, axis=0).max(), np.ptp(body, axis=0).max()
     sides = garment.vertices.min(axis=0) - body.max(axis=0), body.min(axis=0) - garment.vertices.max(axis=0)
     gap = np.maximum(*sides).max()
@@ -111,13 +112,14 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
         raise InputError(
             f"a garment about the size of the body ({tall:.2f} m) expected", file=file, field="vertices",
             value=f"{size:.3g} m",
-            mend=_mend(garment, body) or "bring it there by ncs fit, or state its unit by garment.scale in the scene file",
+            mend=_mend(garment, body, told) or ("it may have another unit: mend" if scale_given else "state its unit by")
+            + " garment.scale in the scene file, or bring it there by ncs fit",
         )  # fmt: skip
     if gap > FAR * tall:
         raise InputError(
             "a garment that is on the body expected", file=file, field="vertices", value=f"{gap:.2f} m apart",
-            mend=_mend(garment, body)
-            or "bring it there by ncs fit, or move it into the body's coordinates, or turn its axes to Y up: garment.up",
+            mend=_mend(garment, body, told) or "bring it there by ncs fit, or move it into the body's coordinates"
+            + (", or mend garment.up" if axis_given else ", or turn its axes to Y up: garment.up"),
         )  # fmt: skip
     if not axis_given and distance_outside(garment.vertices, body) > FAR:
         raw = garment.vertices @ TURNS[garment.up].T
@@ -130,11 +132,14 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
             )  # fmt: skip
 
 
-def _mend(garment: GarmentRecord, body: np.ndarray) -> str:
-    """Return what to write into the scene file so that the garment lies on the body; empty where nothing helps."""
+def _mend(garment: GarmentRecord, body: np.ndarray, told: tuple[bool, bool]) -> str:
+    """Return what to write into the scene file so that the garment lies on the body; empty where nothing helps.
+
+    told: the scene states the unit, the axis. In a unit that is stated the garment may merely be beside the body.
+    """
     raw = garment.vertices / garment.scale @ TURNS[garment.up].T
-    for up in dict.fromkeys((garment.up, "y", "z", "x")):
-        for scale in dict.fromkeys((garment.scale, *UNITS)):
+    for up in (garment.up,) if told[1] else dict.fromkeys((garment.up, "y", "z", "x")):
+        for scale in (garment.scale,) if told[0] else dict.fromkeys((garment.scale, *UNITS)):
             x = upright(raw, scale, up)
             if distance_outside(x, body) <= FAR and np.ptp(x, axis=0).max() >= FAR * np.ptp(body, axis=0).max():
                 words, fields = [], []
@@ -142,6 +147,9 @@ def _mend(garment: GarmentRecord, body: np.ndarray) -> str:
                     words, fields = [UNITS[scale]], [f"scale = {scale:g}"]
                 if up != garment.up:
                     words, fields = [*words, f"{up.upper()} up"], [*fields, f'up = "{up}"']
+                if told[0]:
+                    other = f"if its axes are others, write {fields[0]} below [garment] in the scene file"
+                    return f"bring it there by ncs fit, or, {other}"
                 guess = f"it looks like {', '.join(words)}: write {' and '.join(fields)} below [garment] in the scene file"
                 return f"{guess}, or let ncs fit find its unit, axes and place"
     return ""

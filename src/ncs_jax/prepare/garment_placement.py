@@ -17,7 +17,7 @@ from ncs_jax.prepare.hanging import CENTRED, SHAPED, Trunk, opening_on, trunk_of
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.straps import lift_to_rest
-from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, pierced, skin_of, threaded
+from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, large_loops, pierced, skin_of, threaded
 
 __all__ = ["AXES", "TURNED", "place"]
 
@@ -34,6 +34,7 @@ ROUGH = 1 / 30, 3.0  # these two, while the places are found roughly
 PRESS = 25.0  # a point deep inside the body counts as one so many times as far outside
 TINY = 1 / 5  # of the body's height: a garment that is smaller is a sock or a doll's, which its unit must be told for
 ON_BODY = 0.05  # least share of a garment that lies on the body
+CARRIED, UPWARD = 0.01, 0.6  # m^2 that lie on skin that faces up, to this cosine, where shoulders carry a garment
 STAYS = 1.1, 0.5  # the misfit may be so many times that of the best place, and so much of the contact must be there
 RIVAL, RESIZED = 0.87, 0.5  # another place is about as good from this share on, one in another unit from this one on
 APART = 0.02  # of the height: what is nearer is no other place
@@ -123,7 +124,7 @@ def place(
         seen += [(w, _look(w, raw, fine, skin, body)) for w in plain]
         ranked = _ranked(seen, fine, skin)
     if move is not None:
-        return replace(ranked[0][1], doubt="")
+        return _given(ranked, fine, skin, (scale is not None, up is not None))
     chosen = _choose(ranked, fine, skin)
     way = next(w for w, look in ranked if look.garment is chosen.garment)
     chosen = _rested(chosen, way, raw, fine, skin, body)
@@ -248,6 +249,34 @@ def _look(way: _Way, raw: GarmentRecord, cloth: Cloth, skin: Skin, body: BodyRec
     garment = replace(raw, vertices=x.astype(raw.vertices.dtype), scale=way.scale, up=way.up)
     mirrored, doubt = cloth.volume < 0, _doubt(lying, bones, share)
     return Placement(garment, way.scale, way.up, way.turn, mirrored, way.shift, lying, inside, bones, share, doubt)
+
+
+def _given(ranked: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin, told: tuple[bool, bool]) -> Placement:
+    """Return a place that was given, in the file's own unit and axes where no others fit; told: its user gave unit and axis.
+
+    Against it speaks only what rules it out: nothing of it is around the body or lies on it, or it is in doubt and its unit and
+    axes are guessed. All else is a warning.
+    """
+    own = [r for r in ranked if r[0].own]
+    way, look = own[0] if ranked[0][1].doubt and own else ranked[0]
+    if not look.doubt:
+        return replace(look, given=True)
+    around = look.threaded > 0 and bool(large_loops([look.garment.vertices[loop] for loop in cloth.loops], skin))
+    if not around and look.lying < ON_BODY and _carried(way, cloth, skin) < CARRIED:
+        doubt = f"the body passes through none of its openings, and {100 * look.lying:.0f} % of it lie on the skin"
+        return replace(look, doubt=doubt, given=True)
+    if not (way.own or all(told)):
+        return replace(look, doubt=f"its unit and axes are not stated, and as they are guessed {look.doubt}", given=True)
+    return replace(look, doubt="", warning=look.doubt, given=True)
+
+
+def _carried(way: _Way, cloth: Cloth, skin: Skin) -> float:
+    """Return the area, m^2, that lies on skin that faces up, as a cape does or a sheet, whose outside nothing tells."""
+    there, normals = way.points(cloth.points), cloth.normals @ way.turned
+    away, side, facing = skin.nearest(there, normals)
+    upward = skin.normals[skin.tree.query(there)[1], 1] > UPWARD
+    on = (np.abs(facing) > 0.5) & (away < 2 * SKIN * skin.height) & (side > -SKIN * skin.height) & upward
+    return float(on.mean()) * cloth.area * way.scale**2
 
 
 def _ranked(seen: list[tuple[_Way, Placement]], cloth: Cloth, skin: Skin) -> list[tuple[_Way, Placement]]:

@@ -121,7 +121,21 @@ def _limb_roles(read: list[Name], tree: _Tree) -> dict[str, int]:
             continue
         key = (name.order, -int(tree.load[j]), j)
         found[f"{name.side} {role}".strip()] = min(key, found.get(f"{name.side} {role}".strip(), key))
-    return {role: j for role, (_, _, j) in found.items() if role != "hips"}
+    named = {role: j for role, (_, _, j) in found.items() if role != "hips"}
+    return _key_points(read, tree, named) | named
+
+
+def _key_points(read: list[Name], tree: _Tree, named: dict[str, int]) -> dict[str, int]:
+    """Return what pose estimators call a head, the nose with eyes or ears on it, and a toe, the big one with few beside it."""
+    nose = [j for j, n in enumerate(read) if n.rest == "nose" and not n.side]
+    on = {read[j].rest for j in range(len(read)) if nose and nose[0] in tree.above[j][1:]}
+    found = {"head": nose[0]} if len(nose) == 1 and any(word.endswith(("eye", "ear")) for word in on) else {}
+    for side in ("left", "right"):
+        toes = [j for j, n in enumerate(read) if n.side == side and n.rest.endswith("toe")]
+        big, foot = [j for j in toes if read[j].rest == "bigtoe"], named.get(f"{side} foot")
+        if len(big) == 1 and len(toes) < TOES and foot in tree.above[big[0]]:
+            found[f"{side} toe"] = big[0]
+    return found
 
 
 def _role(j: int, read: list[Name], tree: _Tree) -> str:

@@ -38,6 +38,7 @@ WORDS = {
 ROLES = {word: role for role, words in WORDS.items() for word in words.split()}
 EITHER = _words("shoulder hip hand palm foot leg arm")
 MIDDLE = _words("head hips")  # roles without a side
+TOES = _words("bigtoe smalltoe")  # of pose estimators
 FINGER = re.compile(r"(?:in)?(?:hand)?(thumb|index|middle|mid|ring|pinky|little|fingers?)(?:finger)?")
 BIPED = ("thumb", "index", "middle", "ring", "pinky")
 SEGMENTS = {"proximal": "1", "intermediate": "2", "medial": "2", "distal": "3"}
@@ -222,4 +223,8 @@ def _side(parts: list[str]) -> tuple[str, list[str]]:
 def _is_limb(word: str) -> bool:
     """Tell whether a word is one of a limb, or begins with one and goes on as twists do."""
     helped = HELPER.sub("", word) or word
-    return (ROLES.get(_known(helped), "head") not in MIDDLE or _known(helped) in EITHER) or bool(FINGER.match(helped))
+    return (
+        word in TOES
+        or (ROLES.get(_known(helped), "head") not in MIDDLE or _known(helped) in EITHER)
+        or bool(FINGER.match(helped))
+    )

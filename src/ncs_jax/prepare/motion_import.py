@@ -19,7 +19,16 @@ from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
-from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, leans, since
+from ncs_jax.prepare.reference_pose import (
+    ZERO,
+    find_reference,
+    from_frame,
+    is_even,
+    is_person,
+    leans,
+    odd_parts,
+    since,
+)
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.motion_lists import LISTING
@@ -113,8 +122,10 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
     of = paired(motion, body, spec.joints)[0]
     person = is_person(rest_of(motion)[0], of)
     bent = spec.rest == "auto" and person and leans(motion, of)
-    if spec.rest == "zero" or (spec.rest == "auto" and person and not bent and is_even(rest_of(motion)[0], of)):
+    if spec.rest == "zero":
         return motion
+    if spec.rest == "auto" and person and not bent and is_even(rest_of(motion)[0], of):
+        return replace(motion, uncertain={part + ZERO: by for part, by in odd_parts(motion, of).items()})
     up = motion.up or standing_axis(motion, of)
     if spec.rest == "auto":
         start = spec.frames[0] if spec.frames else 0

@@ -21,7 +21,7 @@ class Placement:
     turn about the vertical after it, degrees. mirrored: left and right were exchanged. shift (3,): how it was moved then, m.
     lying, inside: shares of its area on the skin, and inside the body. pierced: joints whose bones pass through the cloth.
     threaded: share of its openings, by length, that the body passes through. doubt: what speaks against it; empty: nothing.
-    warning: what is left uncertain in a place that is accepted.
+    warning: what is left uncertain in a place that is accepted. given: its user gave the place.
     """
 
     garment: GarmentRecord
@@ -36,6 +36,7 @@ class Placement:
     threaded: float
     doubt: str = ""
     warning: str = ""
+    given: bool = False
 
     @property
     def worn(self) -> bool:
@@ -51,6 +52,12 @@ class Placement:
 
     def check(self, file: str | Path) -> None:
         """Raise an InputError where the place is in doubt."""
+        if self.doubt and self.given:
+            raise InputError(
+                f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
+                value=f"as the place that was given, {self.options}", mend="look at the picture; state unit and axes by "
+                "--scale and --up, or leave out --stay and --move, so that its place is found",
+            )  # fmt: skip
         if self.doubt:
             other = "if it was made for another body, name that by --from; " if self.pierced or self.threaded <= 0.99 else ""
             raise InputError(

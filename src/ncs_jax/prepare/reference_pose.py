@@ -37,11 +37,16 @@ from ncs_jax.prepare.skeleton import (
     trunk_of,
 )
 
-__all__ = ["Reference", "find_reference", "from_frame", "is_even", "is_person", "leans", "since"]
+__all__ = ["ZERO", "Reference", "find_reference", "from_frame", "is_even", "is_person", "leans", "odd_parts", "since"]
 
 SURE = 1.0  # degrees; a part of a built pose that is surer than that is not told
 EVEN = 15.0  # degrees by which limbs of a skeleton at rest may differ from their images in the mirror
 LEAN = 12.0  # degrees by which hips to head lean in a zero pose that is bent (3)
+# Degrees by which neck, head and collars pitch or rise at rest, at least and at most, in skeletons that are not bent there; and
+# by which these lie outside what 18 of 20 upright frames do, where the zero pose is bent alone.
+BUILT = {"neck": (3.0, 45.0), "head": (-25.0, 25.0), "collars": (-18.0, 18.0)}
+ODD = {"neck": 20.0, "head": 20.0, "collars": 15.0}
+ZERO = " of the zero pose"  # ends the name of such a part
 BACKWARD = 0.8  # share of the frames in which feet point back where sides are exchanged (0)
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
 
@@ -155,6 +160,54 @@ def leans(motion: MotionRecord, of: Limbs) -> bool:
     places, up = forward(sampled(motion))[1], np.eye(3)["xyz".index(motion.up or standing_axis(motion, of))]
     moving = angle(places[:, ends[1]] - places[:, ends[0]], up)
     return bool(np.percentile(moving, 33) < bent / 2)
+
+
+def odd_parts(motion: MotionRecord, of: Limbs) -> dict[str, float]:
+    """Return neck, head or collars that are bent in the zero pose as in none of the frames, and by how many degrees.
+
+    A raised collar bone or a head that looks down in an otherwise good T-pose is an error of every frame that nothing else
+    shows. How far neck and head pitch ahead and both collars rise, the latter as seen from the chest, is compared with the
+    upright frames. What skeletons are like at rest is no error: people may look down all the time.
+    """
+    rest, axes = rest_of(motion)[0], body_axes(rest_of(motion)[0], of)
+    few, up = sampled(motion), motion.up or standing_axis(motion, of)
+    turns, places = forward(few)
+    upright = angle(places[:, top(of)] - places[:, of.roles["hips"]], np.eye(3)["xyz".index(up)]) < UPRIGHT
+    if upright.sum() < FEWEST or "head" not in of.roles or not of.spine:
+        return {}
+    turns, places, chest, head = turns[upright], places[upright], of.spine[-1], of.roles["head"]
+    ahead, low = person_axes(places, of, up), of.neck[0] if of.neck else chest
+    found = [("neck", _pitch((rest[head] - rest[low]) @ axes), _pitch(_seen(places[:, head] - places[:, low], ahead)))]
+    if motion.tips is not None and np.linalg.norm(tip := motion.tips[head] - rest[head]) > 0:
+        found += [("head", _pitch(tip @ axes), _pitch(_seen(turns[:, head] @ tip, ahead)))]
+    for side in ("left", "right"):
+        if (bone := _between(rest, of, f"{side} clavicle", f"{side} arm")) is not None:
+            moved = places[:, of.roles[f"{side} arm"]] - places[:, of.roles[f"{side} clavicle"]]
+            found += [(f"{side} collars", _rise(bone @ axes), _rise(_seen(moved, turns[:, chest] @ axes)))]
+    off = {}
+    for part, own, moving in found:
+        kind, (least, most) = part.split()[-1], np.percentile(moving, (5, 95))
+        beyond = float(own - np.clip(own, least, most))
+        if not BUILT[kind][0] <= own <= BUILT[kind][1] and abs(beyond) > ODD[kind]:
+            off[part] = beyond
+    sides = [off.pop(f"{side} collars", 0.0) for side in ("left", "right")]
+    off |= {"collars": min(sides, key=abs)} if sides[0] * sides[1] > 0 else {}
+    return {part: abs(beyond) for part, beyond in off.items()}
+
+
+def _seen(vectors: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return vectors (T, 3) along axes that are the columns of (T, 3, 3)."""
+    return np.einsum("tab,ta->tb", axes, vectors)
+
+
+def _pitch(own: np.ndarray) -> np.ndarray:
+    """Return the degrees by which vectors (..., 3) along left, up, ahead pitch ahead from up."""
+    return np.degrees(np.arctan2(own[..., 2], own[..., 1]))
+
+
+def _rise(own: np.ndarray) -> np.ndarray:
+    """Return the degrees by which vectors (..., 3) along left, up, ahead rise above the horizontal."""
+    return np.degrees(np.arctan2(own[..., 1], np.hypot(own[..., 0], own[..., 2])))
 
 
 def _check_sides(motion: MotionRecord, of: Limbs, up: str) -> None:

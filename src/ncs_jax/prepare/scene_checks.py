@@ -21,6 +21,7 @@ from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vert
 from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
+from ncs_jax.prepare.reference_pose import ZERO
 from ncs_jax.prepare.setting import RECURRENT, Setting
 from ncs_jax.prepare.speed_checks import frame_jumps, speed_faults
 from ncs_jax.prepare.touchable import touchable_faces
@@ -228,8 +229,18 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
 
 
 def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
-    """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most."""
-    built = {name: record.uncertain for name, record in motions.items() if record.uncertain}
+    """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most; and for
+    each motion whose zero pose is bent in one part as no frame is."""
+    for name, record in motions.items():
+        odd = [f"{part.removesuffix(ZERO)} {by:.0f}" for part, by in record.uncertain.items() if part.endswith(ZERO)]
+        if odd:
+            value = f"by so many degrees, as in no upright frame of {name}: {', '.join(odd)}"
+            risk = "its error is in all frames: raised collar bones drop the shoulders, a head that looks down looks up"
+            mend = 'motion.rest = the number of a frame in T-pose or A-pose; "zero" if it is meant so'
+            yield Risk("the zero pose is bent in one part alone", value, risk, mend, name)
+    built = {
+        name: record.uncertain for name, record in motions.items() if any(not part.endswith(ZERO) for part in record.uncertain)
+    }
     if built:
         parts = dict.fromkeys(part for one in built.values() for part in one)
         worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)

@@ -178,7 +178,8 @@ def _check_garment(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord)
             f"a weight for each of the body's {len(body.parents)} joints expected", file=file, field="blend_weights",
             value=garment.weights.shape, mend="fit the garment to this body again: ncs fit",
         )  # fmt: skip
-    check_on_body(file, garment, body.vertices, axis_given=bool(scene.garment.up))
+    told = {"axis_given": bool(scene.garment.up), "scale_given": bool(scene.garment.scale)}
+    check_on_body(file, garment, body.vertices, **told)
 
 
 def _pins(scene: Scene, garment: io.GarmentRecord) -> np.ndarray:

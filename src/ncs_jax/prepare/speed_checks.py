@@ -1,4 +1,4 @@
-"""What is too fast in a motion for what a scene models: glitches, by their frames, and throws beyond a swing's linear range."""
+"""What is too fast in a motion for what a scene models: glitches, by their frames, throws and spins beyond a swing's range."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from ncs_jax.prepare.posing import joint_transforms, world_axes
 from ncs_jax.prepare.setting import Setting
 from ncs_jax.scene.motion_names import split_frames
 
-__all__ = ["frame_jumps", "frames_named", "good_stretches", "speed_faults", "thrown"]
+__all__ = ["flung", "frame_jumps", "frames_named", "good_stretches", "speed_faults", "thrown"]
 
 JUMP = 0.3  # m by which the root or skin may leave its path within a frame: the thickness of a limb
 TURN = 90.0  # degrees within a frame
 THROWN = 1.0  # of a garment's length, by which leaps and lunges throw it, and walks, runs and most dances (0.93) do not
+FLUNG = 4.0  # of its length, off the turning body, by which flips and pirouettes fling it, and most dances (2.8) do not
 SEEN = 100  # points of the garment and of the body that are looked at
 NAMED = 5  # frames, and stretches, that are named
 
@@ -59,12 +60,19 @@ def _throws(a: Setting, name: str, record: MotionRecord) -> _Fault | None:
     some = _some(len(rest))
     path = _paths(a, record, rest[some], a.model.blend, some)
     up = np.abs(gravity).argmax()
-    far = thrown(path, mass[some], record.fps, gravity, float(np.ptp(rest[:, up])), scene.network.damping)
-    if not far.max() > THROWN:
+    hung = mass[some], record.fps, gravity, float(np.ptp(rest[:, up])), scene.network.damping
+    aside, off = thrown(path, *hung), flung(path, *hung)
+    bad, values = (aside > THROWN) | (off > FLUNG), []
+    if aside.max() > THROWN:
+        values += [f"thrown aside by {aside.max():.2f} of its length in {name}, {frames_named(aside, THROWN, record.origin)}"]
+    if (off := np.where(aside > THROWN, 0, off)).max() > FLUNG:
+        value = f"flung off the turning body by {off.max():.1f} of its length"
+        values += [f"{value} in {name}, {frames_named(off, FLUNG, record.origin)}"]
+    if not values:
         return None
-    value = f"the garment thrown aside by {far.max():.2f} of its length in {name}, {frames_named(far, THROWN, record.origin)}"
     risk = "the swing is shortened to its linear range: it lags, and cloth is stretched"
-    return _Fault(far > THROWN, ("fast motion", value, risk, "slow or smooth the motion there, or leave the frames out"))
+    mend = "slow or smooth the motion there, or leave the frames out"
+    return _Fault(bad, ("fast motion", f"the garment {'; '.join(values)}", risk, mend))
 
 
 def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
@@ -78,14 +86,52 @@ def thrown(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, 
     Args:
         path: (frames, points, 3) as the body carries the garment, m. mass: (points,). damping: c, 1/s.
     """
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
+    push = _push(path, fps)
+    return _swung(push - (push @ down)[..., None] * down, mass, fps, gravity, length, damping)
+
+
+def flung(path: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
+    """Return how far a motion flings a garment off the body that turns, r.m.s. over it in every frame, in its own lengths L.
+
+        q'' + c q' + (g / L) q = R^T (-a)_t,   sqrt(mean |q|^2) / L
+
+    It is the pendulum of `thrown`, but it turns with the body. Seen from there, a spin pushes outward for long, and its start
+    and stop push along the turn. R is the rotation of the garment's points as a whole since the first frame. The pendulum hangs
+    along R g, as in a flip cloth has no time to fall: what pushes along R g stretches it. In an even spin at r from the axis it
+    comes to r omega^2 / g, the tangent of the angle at which a conical pendulum flies. Without turns it is `thrown`. Left out
+    are Coriolis' acceleration, and that the centrifugal one grows as cloth flies out.
+
+    Args:
+        as of `thrown`.
+    """
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
+    push = np.einsum("tba,tpb->tpa", _turned(path, mass), _push(path, fps))
+    return _swung(push - (push @ down)[..., None] * down, mass, fps, gravity, length, damping)
+
+
+def _push(path: np.ndarray, fps: float) -> np.ndarray:
+    """Return what pushes a thing that a path (frames, points, 3) holds: less the path's acceleration, m/s^2."""
+    begun = np.concatenate([path[:1], path[:1], path])
+    return -(begun[2:] - 2 * begun[1:-1] + begun[:-2]) * fps**2
+
+
+def _turned(path: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Return the rotation (frames, 3, 3) of points as a whole since the first frame; about no axis on which all of them lie."""
+    own = path - np.average(path, axis=1, weights=mass)[:, None]
+    size = np.sum(mass[:, None] * own[0] ** 2)
+    left, _, right = np.linalg.svd(np.einsum("tpa,pb->tab", own, mass[:, None] * own[0]) + 1e-9 * (size or 1.0) * np.eye(3))
+    left[..., -1] *= np.sign(np.linalg.det(left @ right))[:, None]
+    return left @ right
+
+
+def _swung(push: np.ndarray, mass: np.ndarray, fps: float, gravity: np.ndarray, length: float, damping: float) -> np.ndarray:
+    """Return how far a push (frames, points, 3) swings a pendulum, r.m.s. (frames,), in its lengths; by implicit Euler."""
     pull = float(np.linalg.norm(gravity))
     if not pull or not length:
-        return np.zeros(len(path))
-    h, down, square = 1 / fps, gravity / pull, pull / length
-    begun = np.concatenate([path[:1], path[:1], path])
-    push = -(begun[2:] - 2 * begun[1:-1] + begun[:-2]) / h**2
-    push -= (push @ down)[..., None] * down
-    q, rate, far = np.zeros(path.shape[1:]), np.zeros(path.shape[1:]), np.zeros(len(path))
+        return np.zeros(len(push))
+    h, square = 1 / fps, pull / length
+    q, rate, far = np.zeros(push.shape[1:]), np.zeros(push.shape[1:]), np.zeros(len(push))
     for t, force in enumerate(push):
         rate = (rate + h * (force - square * q)) / (1 + h * damping + h * h * square)
         q = q + h * rate

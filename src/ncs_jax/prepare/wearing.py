@@ -12,7 +12,7 @@ from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 
-__all__ = ["Cloth", "Skin", "cloth_of", "pierced", "skin_of", "threaded"]
+__all__ = ["Cloth", "Skin", "cloth_of", "large_loops", "pierced", "skin_of", "threaded"]
 
 POINTS = 20000  # that stand for the skin
 STEP = 1 / 80  # of the body's height: bones are followed in such steps
@@ -138,13 +138,15 @@ def pierced(x: np.ndarray, faces: np.ndarray, skin: Skin) -> list[int]:
 
 def threaded(loops: list[np.ndarray], skin: Skin) -> float:
     """Return the share, by length, of openings, each (N, 3), that a bone passes through; 1 where there is none."""
-    passed, total = 0.0, 0.0
-    for loop in loops:
-        length = float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum())
-        if length > SMALL * skin.height:
-            total += length
-            passed += length * bool(len(_crossing(skin.bones, _fan(loop))))
-    return passed / total if total else 1.0
+    large = large_loops(loops, skin)
+    passed = sum(length for loop, length in large if len(_crossing(skin.bones, _fan(loop))))
+    return passed / sum(length for _, length in large) if large else 1.0
+
+
+def large_loops(loops: list[np.ndarray], skin: Skin) -> list[tuple[np.ndarray, float]]:
+    """Return the openings that are no buttonholes, and their lengths, m."""
+    lengths = [float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum()) for loop in loops]
+    return [(loop, length) for loop, length in zip(loops, lengths, strict=True) if length > SMALL * skin.height]
 
 
 def _fan(loop: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from ncs_jax.io.character.hierarchy import nearest_parents, path_to_root
 __all__ = ["SLIDE", "SPARE", "bvh_from_moving_root", "check_slides", "moving_root"]
 
 SLIDE = 0.05  # of a bone by which its end may leave its mean place; exporters that fit a motion to other bones leave some
+LIMB = re.compile(r"(hand|wrist|palm|head|neck|foot|ankle|toe|toes|ball|toebase)[^a-z]*(l|r|left|right)?\d*$")
 SPARE = 3  # joints that turn and may be left out, above the joint that carries the path or beside it; two legs are more
 
 
@@ -64,7 +66,8 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
     """Return the motion from the joint on that carries the path, with bones of constant length: see `moving_root`.
 
     A joint's positions are places on its parent that stand for its OFFSET. Positions that do not change are the OFFSET, unless
-    that is zero; positions that are nearer to zero than to the OFFSET are added to it.
+    that is zero; positions that are nearer to zero than to the OFFSET are added to it. A joint that slides and carries nothing,
+    as a prop on a hand, is left out, unless it is called the end of a limb.
     """
     if not bvh.moved:
         return bvh
@@ -83,8 +86,12 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
     finite = bvh.poses[np.isfinite(bvh.poses).all(axis=(1, 2))]
     turns = (np.abs(finite - finite[:1]) > 0.01).any(axis=(0, 2))
     kept = moving_root(bvh.parents, moves, turns & ~moves, SPARE)
+    props = [j for j in kept[1:] if moves[j] and j not in bvh.parents and not LIMB.search(bvh.joint_names[j].lower())]
+    kept = [j for j in kept if j not in props]
     root, others = kept[0], kept[1:]
     notes = check_slides(bvh.file, [bvh.joint_names[j] for j in others], off[others], bones[others], moves[others])
+    if props:
+        notes = (f"left out, as they slide and carry nothing: {', '.join(bvh.joint_names[j] for j in props[:8])}", *notes)
     chain = path_to_root(bvh.parents, root)[::-1]
     turn, place, rest = Rotation.identity(len(bvh.poses)), np.zeros((len(bvh.poses), 3)), np.zeros(3)
     for j in chain:
@@ -95,7 +102,7 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
     if root:
         offsets[root] = rest
         poses[:, 0] = turn.as_rotvec()
-        gone = [n for n in bvh.joint_names if n not in names]
+        gone = [n for j, n in enumerate(bvh.joint_names) if n not in names and j not in props]
         notes = (f"{names[0]} carries the path, so it is the root; left out: {', '.join(gone[:8])}", *notes)
     parents = nearest_parents(bvh.parents, kept)
     return replace(
