@@ -132,7 +132,8 @@ class _Place(NamedTuple):
 
 def _place(problem: Problem, x, held=None, at=None) -> _Place:
     held, at = jnp.zeros((*x.shape, 3), x.dtype) if held is None else held, x if at is None else at
-    return _Place(x, *_evaluated(problem, x, held, at), held, at)
+    here, point, blocks = _evaluated(problem, x, held, at)
+    return _Place(x, here, point, blocks, held, at)
 
 
 def _newton(place: _Place, mass, h: float):
@@ -161,7 +162,7 @@ def _walked(model: Model, matrices, mass, still: Callable) -> Array:
     unposed, h = model.garment.mesh.rest, float(static_step(model))
     for k, pose in enumerate(walk_in(model.skeleton, matrices)):
         problem, transforms = still(pose)
-        place: _Place | None = _place(problem, skin(transforms, unposed))
+        place = _place(problem, skin(transforms, unposed))
         for _ in range(SETTLE if k else FALL):
             _, p = _newton(place, mass, h)
             reached, _, _ = _along(place, p)
