@@ -1,5 +1,7 @@
 """The way from rest into the pose in which a simulation begins."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +22,16 @@ JOINTS = np.array([[0, 1, 0], [0, 1.5, 0], [0.4, 1.5, 0], [0.7, 1.5, 0.1]])
 PARENTS = (-1, 0, 1, 2)
 
 
-def posed(turns, at=(2.0, 0.5, -1.0)):
-    rotations = jnp.asarray(Rotation.from_rotvec(np.asarray(turns, float)).as_matrix())
-    skeleton = Skeleton(jnp.asarray(JOINTS), PARENTS)
-    return skeleton, transforms(skeleton, forward(skeleton, rotations, jnp.asarray(at)))
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    model = sleeve(tmp_path_factory.mktemp("sleeve")).model
+
+    def of(turns, at=(2.0, 0.5, -1.0)):
+        rotations = jnp.asarray(Rotation.from_rotvec(np.asarray(turns, float)).as_matrix())
+        skeleton = Skeleton(jnp.asarray(JOINTS), PARENTS)
+        return replace(model, skeleton=skeleton), transforms(skeleton, forward(skeleton, rotations, jnp.asarray(at)))
+
+    return of
 
 
 def local(matrices):
@@ -32,10 +40,10 @@ def local(matrices):
     return np.stack([Rotation.from_matrix(turn).as_rotvec() for turn in turned], axis=1)
 
 
-def test_the_joints_turn_evenly_from_rest_while_the_root_stays():
+def test_the_joints_turn_evenly_from_rest_while_the_root_stays(posed):
     turns = [[0, 2.0, 0.3], [0.2, 0, 0], [0, 0, -1.2], [0.3, -0.4, 0]]
-    skeleton, matrices = posed(turns)
-    way = walk_in(skeleton, matrices)
+    model, matrices = posed(turns)
+    way = walk_in(model, matrices)
     np.testing.assert_allclose(way[:, 0], np.broadcast_to(matrices[0], (len(way), 3, 4)), atol=1e-9)
     found, every = local(way), np.array([*local(way), *local(np.asarray(matrices)[None])])
     np.testing.assert_allclose(found[0, 1:], 0, atol=1e-9)
@@ -46,9 +54,9 @@ def test_the_joints_turn_evenly_from_rest_while_the_root_stays():
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.5 * ANGLE * 0.1])
-def test_a_body_that_begins_at_rest_has_no_way_to_go(turn):
-    skeleton, matrices = posed([[0, 1.0, 0], [turn, 0, 0], [0, 0, 0], [0, 0, 0]])
-    assert walk_in(skeleton, matrices).shape == (0, 4, 3, 4)
+def test_a_body_that_begins_at_rest_has_no_way_to_go(posed, turn):
+    model, matrices = posed([[0, 1.0, 0], [turn, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert walk_in(model, matrices).shape == (0, 4, 3, 4)
 
 
 def test_a_simulation_begins_where_the_garment_was_led(tmp_path):
@@ -65,7 +73,7 @@ def test_a_simulation_begins_where_the_garment_was_led(tmp_path):
     simulator, settings = simulator_from(model), Settings(tolerance=1e-4, iterations=400)
     first, simulation = led.assembly.track.matrices[0], stepper(simulator, settings)
     follow = jax.jit(lambda state, pose, limit: simulation.follow(state, pose, limit=limit, still=jnp.asarray(True)))
-    state, way = simulation.init(), walk_in(model.skeleton, first)
+    state, way = simulation.init(), walk_in(model, first)
     for pose, limit in zip((*way, first), (FALL, *[SETTLE] * (len(way) - 1), 400), strict=True):
         state, x = follow(state, pose, limit)
     _, skinned = follow(simulation.init(), first, 400)

@@ -117,7 +117,7 @@ def _frame(simulator: Simulator, settings: Settings, state: SimulationState, mat
     """Return the state and the vertices of frame k; in the first the garment follows the body from rest, and comes to rest."""
     if k:
         return _follow(simulator, settings, state, matrices[k], settings.iterations, still=False)
-    for n, pose in enumerate(walk_in(simulator.model.skeleton, matrices[0])):
+    for n, pose in enumerate(walk_in(simulator.model, matrices[0])):
         state, _ = _follow(simulator, settings, state, pose, SETTLE if n else FALL, still=True)
     return _follow(simulator, settings, state, matrices[0], settings.first, still=True)
 

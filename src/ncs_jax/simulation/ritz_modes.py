@@ -160,7 +160,7 @@ def _along(place: _Place, p) -> tuple[_Place | None, float, float]:
 def _walked(model: Model, matrices, mass, still: Callable) -> Array:
     """The garment in unposed space (verts, 3) that has followed the body from rest into a pose, but is not yet still there."""
     unposed, h = model.garment.mesh.rest, float(static_step(model))
-    for k, pose in enumerate(walk_in(model.skeleton, matrices)):
+    for k, pose in enumerate(walk_in(model, matrices)):
         problem, transforms = still(pose)
         place = _place(problem, skin(transforms, unposed))
         for _ in range(SETTLE if k else FALL):

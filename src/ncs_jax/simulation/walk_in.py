@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ncs_jax.geometry.skinning import Skeleton, forward, transforms
+from ncs_jax.geometry.skinning import forward, transforms
+from ncs_jax.scene.model import Model
 
 __all__ = ["FALL", "SETTLE", "walk_in"]
 
@@ -15,17 +16,21 @@ FALL = 20  # iterations at rest, in which the garment falls onto the body,
 SETTLE = 4  # and in each pose after that
 
 
-def walk_in(skeleton: Skeleton, matrices: Float[Array, "joints 3 4"]) -> Float[Array, "poses joints 3 4"]:
+def walk_in(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, "poses joints 3 4"]:
     """Return the poses from rest up to the given one, and without it, for a garment to follow in a few iterations each.
 
     Skinning alone presses cloth together under an arm that is let down, and the equilibrium next to it stands as a wide bell:
     the packaged dress at 1.83 J. Cloth that follows the arm falls in folds: 1.78 J, as it does over a second of motion.
 
     The root stays where the pose has it. Every other joint turns from its rest evenly, about one axis, relative to its parent;
-    no pose is `ANGLE` from the next one. There are none where nothing turns.
+    no pose is `ANGLE` from the next one. There are none where nothing turns, and none over other garments: where these are in
+    such poses is not known.
     """
     from scipy.spatial.transform import Rotation
 
+    if model.under:
+        return matrices[None][:0]
+    skeleton = model.skeleton
     world, parents = np.asarray(matrices, np.float64)[..., :3], np.asarray(skeleton.parents)
     child = parents >= 0
     local = np.where(child[:, None, None], np.swapaxes(world[parents], 1, 2) @ world, world)
