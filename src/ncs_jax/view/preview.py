@@ -88,11 +88,7 @@ def preview(
     moving = "drawing the video" if mp4 else "drawing the GIF"
     tell(PreviewStep(_draw_alphas(folder, by_alpha) if controlled else None, moving, 0.35))
     drawing = lambda share: tell(PreviewStep(None, moving, 0.35 + 0.45 * share))  # noqa: E731
-    if mp4:
-        video.animation_mp4(moved := folder / "preview.mp4", animation, report=drawing)
-    else:
-        few = animation.every(max(1, round(animation.fps / FPS)))
-        pictures.animation_gif(moved := folder / "preview.gif", few, max_frames=FRAMES, size=SIZE, report=drawing)
+    moved = _draw_moving(folder / ("preview.mp4" if mp4 else "preview.gif"), animation, drawing)
 
     tell(PreviewStep(moved, "measuring strain and penetration", 0.8))
     if (drawn := _draw_curves(folder, Path(log or folder / "log.csv"))) is not None:
@@ -101,6 +97,16 @@ def preview(
     write(facts=facts | _facts_of(quantities))
     tell(PreviewStep(None, "done", 1.0))
     return quantities
+
+
+def _draw_moving(file: Path, animation: Animation, report: Callable[[float], None]) -> Path:
+    """Draw a video of every frame, or a GIF of some, as the file's name ends, and return the file."""
+    if file.suffix == ".mp4":
+        video.animation_mp4(file, animation, report=report)
+    else:
+        few = animation.every(max(1, round(animation.fps / FPS)))
+        pictures.animation_gif(file, few, max_frames=FRAMES, size=SIZE, report=report)
+    return file
 
 
 def _some(names: Sequence[str]) -> str:
