@@ -35,6 +35,7 @@ HEAVY = {
     "flatbuffers",
     "viser",
     "DracoPy",
+    "av",
 }
 NUMERIC = {"geometry", "energies", "scene", "network", "simulation", "metrics", "training"}  # compute, and read nothing
 DRAWS = {"view"}

@@ -45,8 +45,11 @@ def add_commands(commands) -> None:
         "--rank", type=arguments.whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
     )
     parser.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
-    parser.add_argument("--out", required=True, metavar="FILE", help=arguments.FORMATS)
+    parser.add_argument("--out", required=True, metavar="FILE", help=f"{arguments.FORMATS}; or .mp4, a video")
     parser.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
+    parser.add_argument(
+        "--checker", action="store_true", help="in an .mp4: a pattern of 4 cm on the cloth, for strain and sliding"
+    )
 
     parser = arguments.command(
         commands, "export", export, "write one step of a trained garment for a host that has neither JAX nor this package"
@@ -68,7 +71,7 @@ def animate(options) -> int:
     from ncs_jax import io
     from ncs_jax.io.animation.animation import animation_suffix
 
-    suffix = animation_suffix(options.out, with_body=options.body)  # before the run is read
+    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body)  # before the run is read
     run, motion = _run_and_motion(options)
     worn_by = None
     if options.body:
@@ -85,6 +88,10 @@ def animate(options) -> int:
         vertices = _refined(run, motion, options)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
+    if suffix == ".mp4":
+        _write_video(run, motion, vertices, options)
+        print(f"{options.out}: {len(vertices)} frames at {fps:g} per second{error}")
+        return 0
     names = arguments.mesh_names(run.assembly.scene)
     io.write_animation(
         options.out, vertices, garment.faces, fps, rest=garment.vertices, uv=garment.uv, worn_by=worn_by, names=names
@@ -95,6 +102,35 @@ def animate(options) -> int:
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0
+
+
+def _video_suffix(options) -> str:
+    """Return .mp4 where a video is asked for and can be made, else nothing."""
+    if Path(options.out).suffix.lower() != ".mp4":
+        if options.checker:
+            raise InputError(
+                "a video expected", file=options.out, field="--checker", mend="end the name in .mp4, or leave it out"
+            )
+        return ""
+    if options.body:
+        raise InputError(".glb expected", file=options.out, field="--body", mend="leave it out: a video shows the body")
+    from ncs_jax.view.video import check_video
+
+    check_video(options.out)
+    return ".mp4"
+
+
+def _write_video(run: Run, motion: MotionRecord, vertices: np.ndarray, options) -> None:
+    """Draw a video of the garment on its body, with a bar."""
+    from ncs_jax.cli.progress import WorkProgress
+    from ncs_jax.view.character import animation_of
+    from ncs_jax.view.video import animation_mp4
+
+    shown = animation_of(run.assembly, motion, vertices)
+    if options.checker:
+        shown = replace(shown, checker=run.assembly.garment.vertices)
+    with WorkProgress("drawing the video") as progress:
+        animation_mp4(options.out, shown, report=lambda share: progress.show("drawing the video", share, 1.0))
 
 
 def _refined(run: Run, motion: MotionRecord, options) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 from ncs_jax.cli import arguments
 from ncs_jax.cli.progress import WorkProgress
 
-__all__ = ["add_commands", "draw", "preview"]
+__all__ = ["add_commands", "check_video", "draw", "preview"]
 
 
 def add_commands(commands) -> None:
@@ -17,18 +17,29 @@ def add_commands(commands) -> None:
     parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
     parser.add_argument("--motion", metavar="FILE", help="motion file or ncs:NAME (default: the scene's first of validation)")
     parser.add_argument("--out", metavar="DIR", help="folder for the files (default: RUN)")
+    parser.add_argument("--video", action="store_true", help="preview.mp4, every frame, in place of the GIF")
 
 
 def preview(options) -> int:
     """Draw a run, and print how it does on the motion."""
     arguments.check_run(options.folder)
+    out = options.out or options.folder
+    if options.video:
+        check_video(out)
     from ncs_jax.runs.run import load_run
 
-    draw(load_run(options.folder), options.out or options.folder, options.motion, log=Path(options.folder) / "log.csv")
+    draw(load_run(options.folder), out, options.motion, log=Path(options.folder) / "log.csv", video=options.video)
     return 0
 
 
-def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = None) -> dict[str, float]:
+def check_video(out: str | Path) -> None:
+    """Raise an InputError where preview.mp4 cannot be made, before there is work to lose."""
+    from ncs_jax.view import video
+
+    video.check_video(Path(out) / "preview.mp4")
+
+
+def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = None, video: bool = False) -> dict[str, float]:
     """Draw a run into a folder; print each file as soon as it is there, and last how it does on the motion."""
     from ncs_jax.view.preview import preview
 
@@ -39,7 +50,7 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
                 progress.say(f"  {step.file}")
             progress.show(step.next, step.share, 1.0)
 
-        quantities = preview(run, out, motion, log=log, report=show)
+        quantities = preview(run, out, motion, log=log, mp4=video, report=show)
     scene = run.assembly.scene
     name = motion or (*scene.motion.validation, *scene.motion.files)[0]
     never = "" if _is_trained_on(scene.motion.files, name) else ", which it never trained on"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ncs_jax.cli import arguments
-from ncs_jax.cli.preview import draw
+from ncs_jax.cli.preview import check_video, draw
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.errors import InputError
 from ncs_jax.runs.log import Report
@@ -47,6 +47,7 @@ def add_commands(commands) -> None:
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out: to --steps, or --minutes more")
     parser.add_argument("--from", dest="start", metavar="RUN", help="begin with the weights of another run of this garment")
     parser.add_argument("--preview", action="store_true", help="write pictures and a page into the run folder when done")
+    parser.add_argument("--video", action="store_true", help="as --preview, with preview.mp4, every frame, in place of the GIF")
     parser.add_argument(
         "--hosts", type=arguments.hosts, metavar="HOST:PORT,COUNT,RANK",
         help="train with the same command on other hosts: the first one's address, how many there are, and which one this is, "
@@ -58,6 +59,8 @@ def train(options) -> int:
     """Train the garment of a scene, perhaps with other hosts."""
     if options.preset and options.resume:
         raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
+    if options.video:
+        check_video(options.out)
     scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
 
     import jax
@@ -76,8 +79,8 @@ def train(options) -> int:
     if options.hosts is not None:
         jax.distributed.shutdown()  # the others need not wait for the pictures
     if jax.process_index() == 0:
-        if options.preview:
-            draw(run, options.out)
+        if options.preview or options.video:
+            draw(run, options.out, video=options.video)
         given = shlex.join([options.scene, "--out", options.out])
         own = f", with the scene that {options.out}/run.json keeps" if options.resume else ""
         _warn_of_few_steps(run, options.steps, f"ncs train {given} --resume --minutes M goes on{own}")

@@ -65,6 +65,7 @@ class Animation:
     Attributes:
         garment: vertices (frames, verts, 3), m. garment_faces: (faces, 3). fps: frames per second.
         body: of as many frames, or None. up: the world's up, as three numbers; its length does not matter.
+        checker: the garment at rest (verts, 3), m: its cloth is drawn in squares, which show strain and sliding; else None.
 
     Raises:
         InputError: the shapes or frames do not fit together, or a number is not usable.
@@ -75,6 +76,7 @@ class Animation:
     fps: float
     body: PosedBody | None = None
     up: Sequence[float] = (0.0, 1.0, 0.0)
+    checker: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check what was given."""
@@ -90,6 +92,11 @@ class Animation:
                 value=len(self.body.vertices), mend="pose the body by the motion that the garment was animated over",
             )  # fmt: skip
         _unit(self.up)
+        if self.checker is not None and np.shape(self.checker) != self.garment.shape[1:]:
+            raise InputError(
+                f"the garment at rest, {self.garment.shape[1:]}, expected", field="checker", value=np.shape(self.checker),
+                mend="give the vertices of the garment's own file, or None",
+            )  # fmt: skip
 
     def y_up(self) -> Animation:
         """Return this animation turned so that +Y is up."""

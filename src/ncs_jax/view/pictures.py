@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from ncs_jax.view.ground import Ground
 from ncs_jax.view.heading import heading
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
-__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet"]
+__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet", "drawn_frames"]
 
 _ROWS = ("front", "side")
 VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
@@ -33,6 +33,7 @@ VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
 CLOTH, CLOTH_INSIDE = (0.90, 0.47, 0.33), (0.55, 0.25, 0.28)
 BODY, WORN = (0.80, 0.765, 0.73), (0.50, 0.60, 0.70)
 INK, FAINT = (46, 42, 40), (142, 135, 128)
+TOGETHER = 16  # frames of an animation that are in memory, drawn
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class _Stage:
 
     def meshes(self, frame: int) -> list[DrawnMesh]:
         garment, body = self.animation.garment[frame], self.animation.body
-        drawn = [DrawnMesh(garment, self.animation.garment_faces, CLOTH, CLOTH_INSIDE)]
+        drawn = [DrawnMesh(garment, self.animation.garment_faces, CLOTH, CLOTH_INSIDE, self.animation.checker)]
         if body is not None:
             x = body.vertices[frame]
             drawn.append(DrawnMesh(x, body.faces, np.repeat([BODY, WORN], [len(x) - body.worn, body.worn], axis=0)))
@@ -227,30 +228,40 @@ def animation_gif(
             pixels. view: one of `VIEWS`. max_bytes: colours and then frames are dropped until it is no larger.
         report: called with the share of the frames that are drawn.
     """
-    if view not in VIEWS:
-        raise InputError(f"one of {', '.join(VIEWS)} expected", field="view", value=view)
-    stage, fps = _stage(animation), animation.fps
+    fps = animation.fps
     stride = max(1, math.floor(fps / 15 + 0.5))
-    chosen = np.arange(0, stage.frames, stride)[: max(1, max_frames)]
-    half = math.hypot(stage.half[0], stage.half[2]) if view not in ("front", "back") else stage.half[0]
-    camera = Camera(stage.path[0], 2 * stage.half[1] * 1.16, 2 * half * 0.92, VIEWS[view], elevation=12.0)
-
-    def draw(frame: int) -> Image.Image:
-        at = replace(camera, target=stage.path[frame])
-        return Image.fromarray(render(stage.meshes(frame), at, size, ground=stage.ground(frame, 2.6)))
-
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        pictures = []
-        for picture in pool.map(draw, chosen.tolist()):
-            pictures.append(picture)
-            if report is not None:
-                report(len(pictures) / len(chosen))
+    chosen = range(0, len(animation.garment), stride)[: max(1, max_frames)]
+    pictures = []
+    for picture in drawn_frames(animation, chosen, size, view):
+        pictures.append(Image.fromarray(picture))
+        if report is not None:
+            report(len(pictures) / len(chosen))
     colours, step = 255, 1
     while True:
         _write_gif(path, pictures[::step], stride * step / fps, colours)
         if Path(path).stat().st_size <= max_bytes or len(pictures) <= step:
             return
         colours, step = (128, step) if colours == 255 else (colours, step + 1)
+
+
+def drawn_frames(animation: Animation, chosen: Sequence[int], size: tuple[int, int], view: str) -> Iterator[np.ndarray]:
+    """Draw frames of an animation one after the other, each (height, width, 3) uint8; the camera follows the character.
+
+    A few are drawn at a time, so that a long animation does not fill the memory.
+    """
+    if view not in VIEWS:
+        raise InputError(f"one of {', '.join(VIEWS)} expected", field="view", value=view)
+    stage = _stage(animation)
+    half = math.hypot(stage.half[0], stage.half[2]) if view not in ("front", "back") else stage.half[0]
+    camera = Camera(stage.path[0], 2 * stage.half[1] * 1.16, 2 * half * 0.92, VIEWS[view], elevation=12.0)
+
+    def draw(frame: int) -> np.ndarray:
+        at = replace(camera, target=stage.path[frame])
+        return render(stage.meshes(frame), at, size, ground=stage.ground(frame, 2.6))
+
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for start in range(0, len(chosen), TOGETHER):
+            yield from pool.map(draw, chosen[start : start + TOGETHER])
 
 
 def _write_gif(path, pictures, seconds, colours):

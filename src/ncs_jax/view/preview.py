@@ -14,7 +14,7 @@ import numpy as np
 from ncs_jax.errors import InputError
 from ncs_jax.metrics.quality import PARTS, measure_on_host, summarise
 from ncs_jax.runs.run import Run
-from ncs_jax.view import curves, page, pictures
+from ncs_jax.view import curves, page, pictures, video
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.character import animation_of
 
@@ -45,6 +45,7 @@ def preview(
     *,
     title: str = "",
     log: str | Path | None = None,
+    mp4: bool = False,
     report: Callable[[PreviewStep], None] | None = None,
 ) -> dict[str, float]:
     """Write preview.png, .html, .gif, alphas.png and energies.png into a folder; return how the motion comes out at alpha 1.
@@ -61,6 +62,7 @@ def preview(
         motion: a motion's name or file; else the scene's first validation or training motion.
         title: of the page.
         log: the run's log.csv; else that of the folder, if it has one.
+        mp4: a video of every frame, preview.mp4, in place of the GIF; it takes the package av.
         report: called after every file, and as the GIF goes on.
 
     Raises:
@@ -83,18 +85,28 @@ def preview(
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
     write(facts=(facts := _facts_of_the_run(run, names[0], by_alpha)))
     tell(PreviewStep(played, "drawing the alphas", 0.3))
-    tell(PreviewStep(_draw_alphas(folder, by_alpha) if controlled else None, "drawing the GIF", 0.35))
-    drawing = lambda share: tell(PreviewStep(None, "drawing the GIF", 0.35 + 0.45 * share))  # noqa: E731
-    few = animation.every(max(1, round(animation.fps / FPS)))
-    pictures.animation_gif(gif := folder / "preview.gif", few, max_frames=FRAMES, size=SIZE, report=drawing)
+    moving = "drawing the video" if mp4 else "drawing the GIF"
+    tell(PreviewStep(_draw_alphas(folder, by_alpha) if controlled else None, moving, 0.35))
+    drawing = lambda share: tell(PreviewStep(None, moving, 0.35 + 0.45 * share))  # noqa: E731
+    moved = _draw_moving(folder / ("preview.mp4" if mp4 else "preview.gif"), animation, drawing)
 
-    tell(PreviewStep(gif, "measuring strain and penetration", 0.8))
+    tell(PreviewStep(moved, "measuring strain and penetration", 0.8))
     if (drawn := _draw_curves(folder, Path(log or folder / "log.csv"))) is not None:
         tell(PreviewStep(drawn, "measuring strain and penetration", 0.8))
     quantities = _measured(run, animation)
     write(facts=facts | _facts_of(quantities))
     tell(PreviewStep(None, "done", 1.0))
     return quantities
+
+
+def _draw_moving(file: Path, animation: Animation, report: Callable[[float], None]) -> Path:
+    """Draw a video of every frame, or a GIF of some, as the file's name ends, and return the file."""
+    if file.suffix == ".mp4":
+        video.animation_mp4(file, animation, report=report)
+    else:
+        few = animation.every(max(1, round(animation.fps / FPS)))
+        pictures.animation_gif(file, few, max_frames=FRAMES, size=SIZE, report=report)
+    return file
 
 
 def _some(names: Sequence[str]) -> str:

@@ -22,6 +22,8 @@ __all__ = ["PAPER", "DrawnMesh", "render"]
 PAPER = (247, 245, 241)
 """The background, sRGB."""
 
+SQUARE, DARK = 0.04, 0.45  # of a checker: its cubes, m, and the share of light that the dark ones keep
+
 
 @dataclass(frozen=True)
 class DrawnMesh:
@@ -29,12 +31,14 @@ class DrawnMesh:
 
     Attributes:
         vertices: (V, 3) in m. faces: (F, 3). colour: sRGB in 0..1, one or (V, 3). inside: of the back of the faces, if another.
+        checker: where the vertices are at rest (V, 3), m: every other cube of `SQUARE` is drawn darker; else None.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colour: Sequence[float] | np.ndarray
     inside: Sequence[float] | None = None
+    checker: np.ndarray | None = None
 
 
 def render(
@@ -77,18 +81,22 @@ def render(
 
 
 class _Surface(NamedTuple):
-    """Hold all meshes of a picture as one; colours as light, outside by vertex, inside by face, NaN where it is the same."""
+    """Hold all meshes of a picture as one; colours as light, outside by vertex, inside by face, NaN where it is the same.
+
+    checker: in cubes of a checker, by vertex, NaN where there is none; None where no mesh has one.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     outside: np.ndarray
     inside: np.ndarray
+    checker: np.ndarray | None = None
 
 
 def _joined(meshes: Sequence[DrawnMesh]) -> _Surface:
     """Join meshes, without the faces that have a vertex which is not finite."""
-    vertices, faces, normals, outside, inside, count = [], [], [], [], [], 0
+    vertices, faces, normals, outside, inside, checker, count = [], [], [], [], [], [], 0
     for mesh in meshes:
         v, f = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
         good = np.isfinite(v).all(1) & (np.abs(np.nan_to_num(v)) < 1e6).all(1)
@@ -99,10 +107,13 @@ def _joined(meshes: Sequence[DrawnMesh]) -> _Surface:
         outside.append(np.broadcast_to(linear(mesh.colour), v.shape))
         hidden = np.full(3, np.nan) if mesh.inside is None else linear(mesh.inside)
         inside.append(np.broadcast_to(hidden, f.shape))
+        # No wall of a cube lies in a plane of symmetry, where cloth may lie too.
+        checker.append(np.full(v.shape, np.nan) if mesh.checker is None else mesh.checker / SQUARE + np.array([0.5, 0.31, 0.5]))
         count += len(v)
     if not vertices:
         return _Surface(np.zeros((1, 3)), np.zeros((0, 3), np.int64), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((0, 3)))
-    return _Surface(*(np.concatenate(part) for part in (vertices, faces, normals, outside, inside)))
+    joined = _Surface(*(np.concatenate(part) for part in (vertices, faces, normals, outside, inside)))
+    return joined if all(mesh.checker is None for mesh in meshes) else joined._replace(checker=np.concatenate(checker))
 
 
 def _draw_surface(image, surface: _Surface, projection: Projection, screen, shadows: ShadowMap) -> None:
@@ -122,6 +133,9 @@ def _draw_surface(image, surface: _Surface, projection: Projection, screen, shad
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     tinted = ~front & np.isfinite(surface.inside[face, 0])
     colour = np.where(tinted[:, None], np.nan_to_num(surface.inside[face]), colour)
+    if surface.checker is not None:
+        cube = np.floor(np.einsum("nk,nkc->nc", weights, surface.checker[corner])).sum(1)
+        colour = np.where((cube % 2 == 1)[:, None], DARK * colour, colour)  # NaN is neither
     view = projection.eye - position if projection.perspective else np.broadcast_to(-projection.axes[2], position.shape)
     view = view / np.linalg.norm(view, axis=1, keepdims=True)
     image.reshape(-1, 3)[pixel] = shade(position, normal, colour, view, projection.axes, shadows)
