@@ -29,6 +29,7 @@ from ncs_jax.scene.model import Model
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.simulation.implicit_euler import SimulationState, Simulator, simulator_from, stepper
 from ncs_jax.simulation.solver.minimise import Settings, Solution
+from ncs_jax.simulation.walk_in import FALL, SETTLE, walk_in
 
 __all__ = ["Progress", "Trajectory", "simulate"]
 
@@ -108,8 +109,17 @@ def rounding(model: Model) -> float:
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _follow(simulator: Simulator, settings: Settings, state: SimulationState, matrices):
-    return stepper(simulator, settings).follow(state, matrices)
+def _follow(simulator: Simulator, settings: Settings, state: SimulationState, matrices, limit, still):
+    return stepper(simulator, settings).follow(state, matrices, limit=limit, still=still)
+
+
+def _frame(simulator: Simulator, settings: Settings, state: SimulationState, matrices, k: int):
+    """Return the state and the vertices of frame k; the first one follows the body from rest into its pose, and comes to rest."""
+    if k:
+        return _follow(simulator, settings, state, matrices[k], settings.iterations, still=False)
+    for n, pose in enumerate(walk_in(simulator.model.skeleton, matrices[0])):
+        state, _ = _follow(simulator, settings, state, pose, SETTLE if n else FALL, still=True)
+    return _follow(simulator, settings, state, matrices[0], settings.first, still=True)
 
 
 def simulate(
@@ -122,7 +132,8 @@ def simulate(
 ) -> Trajectory:
     """Minimise the scene's energy frame by frame: the ground truth of the network that is trained on the same energy.
 
-    The vertices are of the precision that was computed in.
+    The garment lies on the body at rest. From there it follows the body into the first pose (`simulation.walk_in`) and comes to
+    rest in it: that is the first frame. The vertices are of the precision that was computed in.
 
     Args:
         scene: a scene, or the path of a scene file; its [simulation] says how. motion: a file, or `ncs:NAME`; else the scene's
@@ -191,7 +202,7 @@ def _simulated(
         solutions: list[Solution] = []
         started = time.monotonic()
         for k in range((t - 1) * spec.substeps + 1 if t else 0, t * spec.substeps + 1):
-            state, x = _follow(simulator, settings, state, matrices[k])
+            state, x = _frame(simulator, settings, state, matrices, k)
             solutions.append(jax.device_get(state.solution))
         rows["vertices"].append(np.asarray(x))
         rows["iterations"].append(sum(int(s.iterations) for s in solutions))

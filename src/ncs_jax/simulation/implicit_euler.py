@@ -124,7 +124,8 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
     `step` takes one frame's local rotations (joints, 3, 3) of the model's joints (see `model.local_rotations`) and the root's
     translation (3,) in m, if wanted an external force (verts, 3) in N, and returns the state, whose `solution` tells how the
     solve went, and the vertices (verts, 3) in m.
-    The first frame is the static state in its pose: before it the character is taken to have stood there.
+    The first frame is the static state in its pose: before it the character is taken to have stood there. Its search starts
+    from the garment as the body alone carries it there; a loose one falls in other folds where it is led there, see `walk_in`.
     """
     settings = settings or Settings()
     model = simulator.model
@@ -143,19 +144,22 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
         force: Float[Array, "verts 3"] | None = None,
         start: Float[Array, "verts 3"] | None = None,
         limit: Int[Array, ""] | None = None,
+        still: Bool[Array, ""] | None = None,
     ) -> tuple[SimulationState, Float[Array, "verts 3"]]:
         # start: where the search begins, m; None: where the last frame leads. limit: of iterations, for `settings.iterations`.
+        # still: whether the body has stood in this pose before, as in a first frame; None: only in that one.
         # seen from the root joint: float32 tells places 5 m off no finer than 0.5 um, which in a pin of 1000 N/m is 1 mN
         origin = lax.stop_gradient(matrices[:1, :, 3])
         matrices = matrices.at[:, :, 3].add(-origin)
         transforms = blend(matrices, model.blend)
-        moving = (state.started & settings.inertia).astype(dtype)
+        first = ~state.started if still is None else ~state.started | still
+        moving = (~first & settings.inertia).astype(dtype)
         previous = state.previous - origin
         past = Past(previous, state.before - origin, state.unposed, moving)
         step = step_inputs(model, matrices, past, transforms=transforms, force=force)
         exact = settings.exact_pins and len(model.garment.pins) > 0
         pinned = skin(transforms, rest)[model.garment.pins] if exact else None
-        problem = Problem(model, simulator.couplings, simulator.order, step, pinned, first=~state.started, limit=limit)
+        problem = Problem(model, simulator.couplings, simulator.order, step, pinned, first=first, limit=limit)
         advected = skin(transforms, state.unposed)
         if start is None:
             problem = with_neighbours(problem, find_neighbours(problem, advected))
@@ -168,7 +172,7 @@ def stepper(simulator: Simulator, settings: Settings | None = None) -> Simulatio
             problem, start = _approached(problem, *map(lax.stop_gradient, (last, advected, start)))
         x, solution = equilibrium(settings, problem, start)
         unposed = unpose(transforms, x)
-        x, first = x + origin, ~state.started
+        x = x + origin
         before = (jnp.where(first, x, state.previous), jnp.where(first, unposed, state.unposed))
         return SimulationState(x, before[0], unposed, before[1], jnp.asarray(True), solution), x
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +32,13 @@ from ncs_jax.simulation.solver.problem import (
     stiffness_blocks,
     with_neighbours,
 )
-from ncs_jax.simulation.solver.stiffness import couplings_from
+from ncs_jax.simulation.solver.stiffness import Couplings, couplings_from
+from ncs_jax.simulation.walk_in import FALL, SETTLE, walk_in
 
 __all__ = ["displacement_slopes", "softest_ritz_modes", "stiffness_in_pose"]
 
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
-FALL = 5  # steps without friction, until the garment touches the body
+FREE = 5  # steps without friction, until the garment touches the body
 STEPS = 60  # of Newton's method to the drape, at most
 STILL = {np.dtype(np.float32): 1e-3, np.dtype(np.float64): 1e-5}  # m, r.m.s.: a Newton step this short ends the search
 STICK = 30.0  # rad/s: of a vertex that is held on the body: under its own weight it slips by g / STICK^2, 11 mm
@@ -42,14 +46,17 @@ LOOSE = 1.0  # rad/s: of what nothing holds in a pose, such as a fold that slips
 LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of garments taller than `TALL` less, as of a pendulum
 
 
-def _still(model: Model, matrices: Array) -> tuple[Problem, Array]:
+def _couplings(model: Model) -> Couplings:
+    return couplings_from(model.garment.mesh, None if model.surface is None else model.surface.points)
+
+
+def _still(model: Model, couplings: Couplings, matrices: Array) -> tuple[Problem, Array]:
     """The garment in a pose, seen from the root joint, which no past moves; and its skinning transforms."""
     matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
     model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
     transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
     step = step_inputs(model, matrices, Past(rest, rest, moving=jnp.zeros((), rest.dtype)), transforms=transforms)
-    points = None if model.surface is None else model.surface.points
-    return Problem(model, couplings_from(model.garment.mesh, points), None, step), transforms
+    return Problem(model, couplings, None, step), transforms
 
 
 @jax.jit
@@ -112,38 +119,80 @@ def _solved(matrix, right):
     return splu(matrix.tocsc(), "MMD_AT_PLUS_A", 0, options={"SymmetricMode": True}).solve(right)
 
 
+class _Place(NamedTuple):
+    """A garment in a pose: where it is, what is known there, and the blocks of its stiffness and a mass; and what holds it."""
+
+    x: Array
+    problem: Problem
+    point: Any
+    blocks: Any
+    held: Array
+    at: Array
+
+
+def _place(problem: Problem, x, held=None, at=None) -> _Place:
+    held, at = jnp.zeros((*x.shape, 3), x.dtype) if held is None else held, x if at is None else at
+    return _Place(x, *_evaluated(problem, x, held, at), held, at)
+
+
+def _newton(place: _Place, mass, h: float):
+    """The stiffness K of a place, sparse, and Newton's step from there, which a mass over h^2 damps."""
+    from scipy.sparse import diags
+
+    stiff = _stiff(place.problem, place.blocks, mass)
+    p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(place.point.gradient, np.float64).ravel())
+    return stiff, p.reshape(place.x.shape)
+
+
+def _along(place: _Place, p) -> tuple[_Place | None, float, float]:
+    """The first accepted place on the way p, the share of the way, and that with which the search began; None where none is."""
+    p = jnp.asarray(p, place.x.dtype)
+    longest = t = float(_longest(place.problem, place.point, p))
+    while t >= LEAST_STEP:
+        reached = _place(place.problem, place.x + t * p, place.held, place.at)
+        if _accepted(place.point, reached.point, t, p):
+            return reached, t, longest
+        t /= 2
+    return None, t, longest
+
+
+def _walked(model: Model, matrices, mass, still: Callable) -> Array:
+    """The garment in unposed space (verts, 3) that has followed the body from rest into a pose, but is not yet still there."""
+    unposed, h = model.garment.mesh.rest, float(static_step(model))
+    for k, pose in enumerate(walk_in(model.skeleton, matrices)):
+        problem, transforms = still(pose)
+        place: _Place | None = _place(problem, skin(transforms, unposed))
+        for _ in range(SETTLE if k else FALL):
+            _, p = _newton(place, mass, h)
+            reached, _, _ = _along(place, p)
+            if reached is None:
+                break
+            place = reached
+        unposed = unpose(transforms, place.x)
+    return unposed
+
+
 def _drape(problem: Problem, x, mass):
     """The static equilibrium x_0 near x, and the stiffness K (3 verts, 3 verts) there; None where it comes to no rest.
 
     Without friction or pins a loose garment slides down the body or turns about it, as nothing resists: there is no equilibrium
-    near, and those ways are no vibrations. So what touches the body after `FALL` steps is held there along the body, as
+    near, and those ways are no vibrations. So what touches the body after `FREE` steps is held there along the body, as
     friction holds it: see `_sticking`. Newton's method then converges. A mass over h^2 damps it, the less the farther it gets.
     """
-    from scipy.sparse import diags
-
-    least = float(static_step(problem.model))
-    held, at, h = jnp.zeros((*x.shape, 3), x.dtype), x, least
-    known = _evaluated(problem, x, held, at)
+    least = h = float(static_step(problem.model))
+    place = _place(problem, x)
     for count in range(STEPS):
-        if count == FALL:
-            held, at = _sticking(problem, known[1]), x
-            known = _evaluated(problem, x, held, at)
-        here, point, found = known
-        stiff = _stiff(problem, found, mass)
-        p = _solved(stiff + diags(np.repeat(mass / h**2, 3)), -np.asarray(point.gradient, np.float64).ravel()).reshape(x.shape)
+        if count == FREE:
+            place = _place(problem, place.x, _sticking(problem, place.point), place.x)
+        stiff, p = _newton(place, mass, h)
         step = np.sqrt(mass @ np.square(p).sum(axis=1) / mass.sum())
-        if count > FALL and step < STILL[x.dtype]:
-            return x, stiff
-        p = jnp.asarray(p, x.dtype)
-        longest = t = float(_longest(here, point, p))
-        while not _accepted(point, (known := _evaluated(problem, x + t * p, held, at))[1], t, p):
-            t /= 2
-            if t < LEAST_STEP:
-                break
-        if t < LEAST_STEP:  # as near as rounding lets it come, or lost
-            return (x, stiff) if count > FALL and step < 10 * STILL[x.dtype] else None
-        x = x + t * p
-        if count >= FALL:
+        if count > FREE and step < STILL[x.dtype]:
+            return place.x, stiff
+        reached, t, longest = _along(place, p)
+        if reached is None:  # as near as rounding lets it come, or lost
+            return (place.x, stiff) if count > FREE and step < 10 * STILL[x.dtype] else None
+        place = reached
+        if count >= FREE:
             h = min(2 * h, 1 / (2 * np.pi * LEAST)) if t > 0.5 else h if t > 0.25 * longest else max(h / 2, least)
     return None
 
@@ -169,7 +218,8 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     from scipy.linalg import eigh
     from scipy.sparse import diags
 
-    problem, transforms = _still(model, track.matrices[0])
+    still = functools.partial(_still, model, _couplings(model))
+    problem, transforms = still(track.matrices[0])
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
     held = np.asarray(model.garment.pins) if model.terms.pinning else ()
@@ -180,7 +230,8 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
-    drape = _drape(problem, worn := skin(transforms, mesh.rest), mass)
+    worn, led = (skin(transforms, x) for x in (mesh.rest, _walked(model, track.matrices[0], mass, still)))
+    drape = _drape(problem, led, mass)
     if drape is None:
         return None
     x, stiff = drape
@@ -213,7 +264,7 @@ def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarr
     """
     from scipy.sparse import diags
 
-    problem, transforms = _still(model, matrices)
+    problem, transforms = _still(model, _couplings(model), matrices)
     x = skin(transforms, model.garment.mesh.rest + offsets)
     free = jnp.zeros((*x.shape, 3), x.dtype)
     _, point, (diagonal, off) = _evaluated(problem, x, free, x)
