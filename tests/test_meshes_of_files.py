@@ -75,6 +75,21 @@ def test_a_garment_in_every_encoding(tmp_path, kind):
     assert found.faces.tolist() == faces.tolist()
 
 
+def test_strips_that_triangles_without_area_join(tmp_path):
+    """Two rows of a strip are one, joined by corners that are named twice."""
+    x = np.array([[i, k, 0.1 * i * i] for k in range(3) for i in range(4)], np.float32)
+    rows = [[c for i in range(4) for c in (4 * k + i, 4 * k + 4 + i)] for k in range(2)]
+    strip = np.array([*rows[0], rows[0][-1], rows[1][0], *rows[1]])
+    path = plain(tmp_path / "strip.glb", {"cloth": (x, strip)})
+    edited(path, lambda tree: tree["meshes"][0]["primitives"][0].update(mode=5))
+    found = io.read_garment(path)
+    assert len(found.faces) == 12
+    a, b, c = np.moveaxis(found.vertices[found.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] < 0).all()
+    assert np.abs(normals[:, 2]).sum() / 2 == pytest.approx(6)
+
+
 def test_a_mirrored_node_keeps_the_outside_outside(tmp_path):
     x, faces = grid()
     path = plain(tmp_path / "g.glb", {"Dress": (x.astype(np.float32), faces)})
@@ -283,6 +298,22 @@ def test_a_body_under_another_suffix(tmp_path):
         (tmp_path / f"body{suffix}").write_text("x")
         with pytest.raises(InputError, match=rf"one of \.npz, \.glb, \.vrm, \.gltf, \.fbx expected.*{words}"):
             io.read_body(tmp_path / f"body{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".vrm"])
+def test_gltf_that_was_renamed_is_read_as_what_it_is(tmp_path, suffix):
+    right = io.read_body(write_glb(tmp_path / "hero.glb"))
+    binary = (tmp_path / "hero.glb").read_bytes()
+    gltf = gl.GLTF2().load(str(tmp_path / "hero.glb"))
+    gltf.convert_buffers(gl.BufferFormat.DATAURI)
+    gltf.save_json(str(tmp_path / "text.gltf"))
+    (tmp_path / "binary.gltf").write_bytes(binary)
+    (tmp_path / f"text{suffix}").write_bytes(b"\xef\xbb\xbf " + (tmp_path / "text.gltf").read_bytes())
+    for name in ("text.gltf", "binary.gltf", f"text{suffix}"):
+        np.testing.assert_array_equal(io.read_body(tmp_path / name).vertices, right.vertices)
+    (tmp_path / f"page{suffix}").write_bytes(b"<!DOCTYPE html><html></html>")
+    with pytest.raises(InputError, match="begins with 'glTF' expected"):
+        io.read_body(tmp_path / f"page{suffix}")
 
 
 def test_packaged_files_have_their_short_names():

@@ -262,6 +262,16 @@ def test_postures_that_nobody_holds_are_told(rng, body):
     assert "arms inside the trunk" in [f[0] for f in posture_faults(replace(right, poses=crossed), body, "y")]
 
 
+def test_inverse_rotations_are_told_by_their_knees(body):
+    """Matrices for rows in place of columns turn everything the other way: knees bend forward, in the frames that bend them."""
+    motion = walk()
+    motion = replace(motion, poses=1.8 * motion.poses)
+    inverse = replace(motion, poses=-motion.poses)
+    right, wrong = ([f for f in posture_faults(driven(m, body)[2], body, "y") if "knee" in f[0]] for m in (motion, inverse))
+    assert not right and [f[0] for f in wrong] == [f"the {side} knee bends forward" for side in ("left", "right")]
+    assert all("rotations are inverse" in f[2] for f in wrong)
+
+
 @pytest.mark.parametrize("degrees", [30, 60, 90])
 def test_collars_or_feet_alone_that_are_no_persons_are_told_by_name(body, degrees):
     motion = walk()
@@ -365,6 +375,8 @@ def test_a_root_above_the_hips_and_bones_that_slide(tmp_path, body):
         "above": bvh_text(motion, {hips: np.broadcast_to(home, here.shape)}, motion.translation),
         "added": bvh_text(motion, {hips: motion.translation}, np.zeros((FRAMES, 3))),
     }
+    between = f"JOINT reference\n{{\nOFFSET 0 0 0\nCHANNELS 0\nJOINT {hips}\n"
+    files["deep"] = files["still"].replace(f"JOINT {hips}\n", between).replace("}\nMOTION", "}\n}\nMOTION")
     knee = motion.joint_names[[k[1] for k in figure("mixamo")[3]].index("shin")]
     bone = np.array([0, -0.42, 0])
     for name, share in (("slides", 0.03), ("stretches", 0.3)):
@@ -396,6 +408,57 @@ def test_hips_and_spine_beside_each_other(body):
     other = replace(motion, joint_names=("Base_Root", *names), parents=above, joints=joints, poses=poses)
     angle, far = apart(driven(motion, body), driven(other, body))
     assert angle.max() < 1e-3 and far < 1e-5
+    sway = Rotation.from_rotvec(0.3 * np.sin(np.arange(FRAMES) / 4)[:, None] * [0, 0.6, 0.8])  # the pelvis alone turns
+    poses[:, 1] = (sway * Rotation.from_rotvec(motion.poses[:, 0])).as_rotvec()
+    poses[:, spine] = (Rotation.from_rotvec(motion.poses[:, 0]) * Rotation.from_rotvec(poses[:, spine])).as_rotvec()
+    poses[:, 0] = 0
+    turned, places, told = driven(replace(other, poses=poses), body)
+    seen = turned[:, body.joint_names.index("Hips")] @ np.swapaxes(Rotation.from_rotvec(poses[:, 1]).as_matrix(), 1, 2)
+    np.testing.assert_allclose(seen, np.broadcast_to(np.eye(3), seen.shape), atol=1e-9)
+    above, before = body.joint_names.index("LowerBack"), driven(motion, body)
+    np.testing.assert_allclose(turned[:, above], before[0][:, above], atol=1e-9)
+    assert told.driven["Hips"] == names[0]
+    hips = body.joint_names.index("Hips")
+    moved = (places - before[1])[:, hips]
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-9)  # up or down to the soles
+
+
+@pytest.mark.parametrize("change", ["names", "axes", "axes of its own"])
+def test_left_and_right_that_are_exchanged_are_told(rng, body, change):
+    """Names as a viewer sees the sides, and left-handed axes, put the toes behind; pairs by motion.joints mend the names."""
+    motion = walk()
+    names = tuple(n.replace("Left", "@").replace("Right", "Left").replace("@", "Right") for n in motion.joint_names)
+    other = replace(motion, joint_names=names)
+    if change != "names":
+        mirror = np.array([1, 1, -1.0])
+        other = replace(
+            motion, joints=motion.joints * mirror, poses=-motion.poses * mirror, translation=motion.translation * mirror
+        )
+    if "own" in change:
+        other = told_since(other, Rotation.random(len(other.parents), rng=rng).as_matrix())
+    with pytest.raises(InputError, match=r"feet that point back, in .* left and right are exchanged"):
+        driven(other, body)
+    if change == "names":
+        ours = {n: o.split(":")[-1] for n, o in zip(names, motion.joint_names, strict=True)}
+        mended = driven(other, body, joints={n: o for n, o in ours.items() if n.split(":")[-1] != o})
+        angle, far = apart(driven(motion, body), mended)
+        assert angle.max() < 1e-3 and far < 1e-5
+
+
+@pytest.mark.parametrize("degrees", [-25, 25, 50])
+def test_a_zero_pose_that_is_bent_alike_on_both_sides_is_no_standing(body, degrees):
+    """A bow or a crouch is none where the frames are upright; who is bent in the frames as at rest stays as it is."""
+    motion = walk()
+    legs = ("UpLeg", "Leg", "Foot", "Toe")
+    bend = Rotation.from_rotvec([np.radians(degrees), 0, 0]).as_matrix()
+    turns = np.array([np.eye(3) if n.endswith(legs) or "Toe" in n else bend for n in motion.joint_names])
+    other = told_since(motion, turns)
+    angle, _ = apart(driven(motion, body), driven(other, body))
+    trunk = [j for j, n in enumerate(body.joint_names) if any(w in n for w in ("Hips", "Spine", "Back", "Shoulder"))]
+    assert angle[trunk].max() < 2
+    assert "the zero pose is bent, as the frames are not" in " ".join(driven(other, body)[2].notes)
+    hunched = replace(motion, joints=other.joints)
+    assert "reference pose" not in " ".join(driven(hunched, body)[2].notes)
 
 
 def test_the_tool_that_tries_folders_tells_what_is_off(tmp_path, body, capsys):

@@ -25,7 +25,7 @@ from ncs_jax.io.character.rig import quarter_turns
 from ncs_jax.prepare.joint_names import Limbs
 from ncs_jax.prepare.skeleton import LIMBS, angle, forward, least_turn, person_axes, rest_of, sampled, top, trunk_of
 
-__all__ = ["build_pose"]
+__all__ = ["FEWEST", "UPRIGHT", "build_pose"]
 
 UPRIGHT = 35.0  # degrees by which hips to head may lean in a frame that tells about standing
 FEWEST = 3  # such frames

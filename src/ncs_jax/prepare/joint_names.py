@@ -24,6 +24,7 @@ class Limbs:
 
     roles: the joint of each role, such as "hips", "head", "left forearm"; a joint without a role is listed by its plain name.
     spine: joints from above or beside the hips to the one that carries the arms. neck: joints from there to below the head.
+    pelvis: the joint below the hips and beside the spine that carries both legs; None where the hips carry them.
     shaped: roles that the names do not tell, but the skeleton's shape at rest.
     """
 
@@ -31,6 +32,7 @@ class Limbs:
     spine: tuple[int, ...]
     neck: tuple[int, ...]
     shaped: tuple[str, ...] = ()
+    pelvis: int | None = None
 
 
 class _Tree:
@@ -95,7 +97,8 @@ def anatomy(names: Sequence[str], parents: Sequence[int], joints: np.ndarray | N
         if j not in told:
             roles.setdefault(f"{name.side} {name.finger or name.rest}".strip(), j)
     roles = {word: j for word, j in roles.items() if j not in trunk} | {"hips": hips}
-    return Limbs(roles, spine, neck, tuple(word for word in roles if word in shaped))
+    beside = legs is not None and legs != hips and legs not in spine and tree.carries(hips, legs)
+    return Limbs(roles, spine, neck, tuple(word for word in roles if word in shaped), legs if beside else None)
 
 
 def _missing(named: dict[str, int], read: list[Name], parents: Sequence[int], joints: np.ndarray) -> dict[str, int]:
@@ -184,13 +187,15 @@ def pair(source: Limbs, target: Limbs) -> dict[int, int]:
     """Return the source's joint that drives each joint of the target: the one of equal role; spine and neck are spread evenly.
 
     The last joints of both spines are paired, because the arms hang on them. Where one spine is a single joint, the source's
-    last joint drives the target's lowest.
+    last joint drives the target's lowest. A pelvis beside the spine, as of Daz and MMD, drives the target's, or its hips.
     """
     pairs = {j: source.roles[word] for word, j in target.roles.items() if word in source.roles}
     for here, there in ((source.spine, target.spine), (source.neck, target.neck)):
         count = min(len(here), len(there))
         for i in range(count):
             pairs[there[_spread(i, count, len(there), 0)]] = here[_spread(i, count, len(here), len(here) - 1)]
+    if source.pelvis is not None:
+        pairs[target.roles["hips"] if target.pelvis is None else target.pelvis] = source.pelvis
     return dict(sorted(pairs.items()))
 
 

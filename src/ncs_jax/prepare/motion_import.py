@@ -19,7 +19,7 @@ from ncs_jax.io import BodyRecord, MotionRecord, read_body
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
-from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, since
+from ncs_jax.prepare.reference_pose import find_reference, from_frame, is_even, is_person, leans, since
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.motion_lists import LISTING
@@ -112,7 +112,8 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
     motion = motion if spec.up == "auto" else replace(motion, up=spec.up)
     of = paired(motion, body, spec.joints)[0]
     person = is_person(rest_of(motion)[0], of)
-    if spec.rest == "zero" or (spec.rest == "auto" and person and is_even(rest_of(motion)[0], of)):
+    bent = spec.rest == "auto" and person and leans(motion, of)
+    if spec.rest == "zero" or (spec.rest == "auto" and person and not bent and is_even(rest_of(motion)[0], of)):
         return motion
     up = motion.up or standing_axis(motion, of)
     if spec.rest == "auto":
@@ -123,6 +124,7 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
         except InputError:  # frames that the scene leaves out may be broken
             first, last = _frames(motion, 0, LOOK), _frames(motion, -LOOK)
         why = "a moment of a movement, with left and right unlike" if person else "no person"
+        why = "bent, as the frames are not" if bent else why
         try:
             found = find_reference(motion, of, up, first, last)
             found = replace(found, note=f"{found.note}; the zero pose is {why}")

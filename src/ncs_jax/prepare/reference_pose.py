@@ -20,14 +20,29 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io import MotionRecord
-from ncs_jax.prepare.built_pose import build_pose
+from ncs_jax.prepare.built_pose import FEWEST, UPRIGHT, build_pose
 from ncs_jax.prepare.joint_names import Limbs
-from ncs_jax.prepare.skeleton import LIMBS, angle, forward, joint_turns, person_axes, rest_of, side_vector, top, trunk_of
+from ncs_jax.prepare.skeleton import (
+    LIMBS,
+    angle,
+    body_axes,
+    forward,
+    joint_turns,
+    person_axes,
+    rest_of,
+    sampled,
+    side_vector,
+    standing_axis,
+    top,
+    trunk_of,
+)
 
-__all__ = ["Reference", "find_reference", "from_frame", "is_even", "is_person", "since"]
+__all__ = ["Reference", "find_reference", "from_frame", "is_even", "is_person", "leans", "since"]
 
 SURE = 1.0  # degrees; a part of a built pose that is surer than that is not told
 EVEN = 15.0  # degrees by which limbs of a skeleton at rest may differ from their images in the mirror
+LEAN = 12.0  # degrees by which hips to head lean in a zero pose that is bent (3)
+BACKWARD = 0.8  # share of the frames in which feet point back where sides are exchanged (0)
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
 
 
@@ -56,8 +71,9 @@ def find_reference(motion: MotionRecord, of: Limbs, up: str, first: MotionRecord
             file's first and last frames.
 
     Raises:
-        InputError: no frame is such a pose, nor are there upright ones to build it from.
+        InputError: no frame is such a pose, nor are there upright ones to build it from; or left and right are exchanged.
     """
+    _check_sides(motion, of, up)
     found = _among(first, of, up) or _at_end(last, of, up) or _built(motion, of, up)
     if found is None:
         raise InputError(
@@ -124,6 +140,42 @@ def is_even(places: np.ndarray, of: Limbs) -> bool:
     """
     own = places @ person_axes(places, of, "y")
     return _asymmetry(own, of) < EVEN or _bend(own, of) < EVEN
+
+
+def leans(motion: MotionRecord, of: Limbs) -> bool:
+    """Tell whether the zero pose is bent where the frames are not: a crouch, a bow, or a stance to fight in.
+
+    Hips to head lean by more than `LEAN`, and in a third of the frames by less than half of that. Those who are bent by nature
+    are so in their frames too.
+    """
+    rest, ends = rest_of(motion)[0], [of.roles["hips"], top(of)]
+    bent = angle(rest[ends[1]] - rest[ends[0]], body_axes(rest, of)[:, 1])
+    if bent < LEAN:
+        return False
+    places, up = forward(sampled(motion))[1], np.eye(3)["xyz".index(motion.up or standing_axis(motion, of))]
+    moving = angle(places[:, ends[1]] - places[:, ends[0]], up)
+    return bool(np.percentile(moving, 33) < bent / 2)
+
+
+def _check_sides(motion: MotionRecord, of: Limbs, up: str) -> None:
+    """Raise an InputError where both feet of an upright person point back: left is called right, or axes are left-handed."""
+    places, vertical = forward(sampled(motion))[1], np.eye(3)["xyz".index(up)]
+    places = places[angle(places[:, top(of)] - places[:, of.roles["hips"]], vertical) < UPRIGHT]
+    ahead, share = person_axes(places, of, up)[..., 2], []
+    for side in ("left", "right"):
+        foot, toe = (of.roles.get(f"{side} {part}") for part in ("foot", "toe"))
+        if foot is None or toe is None:
+            return
+        flat = places[:, toe] - places[:, foot]
+        flat = flat - (flat @ vertical)[:, None] * vertical
+        share.append(float((angle(flat, -ahead) < 60).mean()) if len(flat) >= FEWEST else 0.0)
+    if min(share) > BACKWARD:
+        raise InputError(
+            "a person whose feet point ahead expected", field="joint_names",
+            value=f"feet that point back, in {100 * min(share):.0f} % of the frames",
+            mend="left and right are exchanged: export it with right-handed axes, or, if only the names are exchanged, "
+            "pair the joints of each side with the body's other one by motion.joints",
+        )  # fmt: skip
 
 
 def _between(places: np.ndarray, of: Limbs, start: str, end: str) -> np.ndarray | None:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
+from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
@@ -131,7 +132,7 @@ def retarget(
     legs = _leg_length(source, rest)
     scaled_by = "as the scene says" if scale else "by the legs" if legs > 0 else "by the trunk"
     scale = scale or _leg_ratio(rest, body, source, target)
-    hips_s, hips_t = source.roles["hips"], target.roles["hips"]
+    hips_s, hips_t = _middle(source, rest_of(motion)[1]), target.roles["hips"]
     home = body.joints[hips_t] - scale * quarter.T @ rest[hips_s]
     bodily = replace(motion, poses=local, translation=np.zeros((len(turns), 3)), joints=body.joints, parents=body.parents)
     offsets = forward(bodily, world_turns)[1]  # with the root at its rest place
@@ -173,6 +174,15 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
             mend=f"pair them with the body's by motion.joints in the scene file; the body has {', '.join(names)}",
         )  # fmt: skip
     return source, target, pairs
+
+
+def _middle(source: Limbs, parents: np.ndarray) -> int:
+    """Return the joint whose place is that of the hips: of a pelvis beside the spine, the one that carries both."""
+    hips = source.roles["hips"]
+    if hips != source.pelvis or not source.spine:
+        return hips
+    trunk = path_to_root(parents, source.spine[0])
+    return next(j for j in path_to_root(parents, hips) if j in trunk)
 
 
 def _lacking(motion: MotionRecord, names: tuple[str, ...], target: Limbs, pairs: dict[int, int]) -> dict[str, str]:

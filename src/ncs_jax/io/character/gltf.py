@@ -210,15 +210,17 @@ class Gltf:
 def read_gltf(path: str | Path) -> Gltf:
     """Open a .glb, .vrm, .vrma or .gltf and check its header and JSON; accessors are read when they are asked for.
 
-    Buffers may be in the file, in a data URI, or in another file of the same folder or below. Nothing else is opened.
+    Buffers may be in the file, in a data URI, or in another file of the same folder or below. Nothing else is opened. A file
+    that was renamed is read as what it is: binary or text.
     """
     file = readable(path)
-    size, most = file.stat().st_size, LARGEST if file.suffix.lower() in BINARY else TEXT
+    binary = _is_binary(file)
+    size, most = file.stat().st_size, LARGEST if binary else TEXT
     if size > most:
         raise InputError(f"at most {most} bytes expected", file=file, value=f"{size} bytes", mend="write a .glb, or split it")
     with reading(file, "glTF"):
         text, chunk = file.read_bytes(), None
-        if file.suffix.lower() in BINARY:
+        if binary:
             text, chunk = _chunks(file, text)
         tree = json.loads(text.decode("utf-8-sig"), parse_constant=_no_number)
         if not isinstance(tree, dict):
@@ -239,6 +241,14 @@ def read_gltf(path: str | Path) -> Gltf:
                 MESHOPT if foreign[0].endswith("meshopt_compression") else "export without it",
             )
         return found
+
+
+def _is_binary(file: Path) -> bool:
+    """Tell whether a file is binary glTF: by how it begins, else by its suffix."""
+    with file.open("rb") as stream:
+        start = stream.read(16)
+    text = start.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+    return start.startswith(b"glTF") or (file.suffix.lower() in BINARY and not text)
 
 
 def _no_number(name: str) -> float:

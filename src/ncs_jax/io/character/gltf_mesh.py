@@ -131,7 +131,8 @@ def _faces(gltf: Gltf, one: dict, where: str, count: int) -> np.ndarray:
     if mode == TRIANGLES + 1:  # a strip: every other triangle is turned around
         faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
         faces[1::2] = faces[1::2, [1, 0, 2]]
-        return faces
+        a, b, c = faces.T
+        return faces[(a != b) & (b != c) & (c != a)]  # such join strips, and draw nothing
     return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
 
 

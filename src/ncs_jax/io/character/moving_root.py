@@ -88,7 +88,7 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
     chain = path_to_root(bvh.parents, root)[::-1]
     turn, place, rest = Rotation.identity(len(bvh.poses)), np.zeros((len(bvh.poses), 3)), np.zeros(3)
     for j in chain:
-        place = place + turn.apply(places.get(j, np.broadcast_to(offsets[j], place.shape)))
+        place = place + turn.apply(places.get(j, np.tile(offsets[j], (len(place), 1))))
         turn, rest = turn * Rotation.from_rotvec(bvh.poses[:, j]), rest + bvh.offsets[j]
     names = tuple(bvh.joint_names[j] for j in kept)
     poses = bvh.poses[:, kept]

@@ -32,7 +32,7 @@ class NamedMesh:
 
     def called(self, name: str) -> bool:
         """Tell whether a name means this mesh."""
-        return name in (self.name, self.material, *self.others)
+        return bool(name) and name in (self.name, self.material, *self.others)
 
 
 def chosen_meshes(file: Path, field: str, wanted: Sequence[str], meshes: Sequence[NamedMesh]) -> np.ndarray:
