@@ -192,6 +192,18 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     assert "gone.obj" in capsys.readouterr().err
 
 
+def test_a_refused_garment_is_drawn_though_the_folder_of_its_file_is_missing(tmp_path, capsys):
+    """One that lies on nothing ends in a picture, one line and exit code 2, not in a traceback."""
+    write_scene(tmp_path)
+    given = sleeve(0.3)
+    trimesh.Trimesh(given.vertices, given.faces, process=False).export(tmp_path / "g.obj")
+    command = ["fit", str(tmp_path / "g.obj"), "--body", str(tmp_path / "body.npz"), "--scale", "1", "--up", "x"]
+    out = tmp_path / "missing" / "folder" / "fitted.npz"
+    assert main([*command, "--out", str(out)]) == 2
+    assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG" and not out.exists()
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_weights_of_another_body_are_refused(tmp_path):
     scene = write_scene(tmp_path)
     cloth = dict(np.load(tmp_path / "cloth.npz"))

@@ -350,7 +350,7 @@ def test_a_garment_across_the_body_is_refused_unless_the_scene_says_so():
 
 def test_a_garment_of_the_right_but_unusual_unit_that_lies_down_is_told_its_axis():
     x = grid()[0] @ np.array(TURNED["z"])
-    with pytest.raises(InputError, match=r'it looks like Z up: write up = "z" below'):
+    with pytest.raises(InputError, match=r'it looks like Z up: write up = "z" below .*, or let ncs fit find'):
         check_on_body(Path("g.npz"), garment(x, scale=0.1), post()["vertices"], axis_given=False)
 
 

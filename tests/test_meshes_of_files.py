@@ -319,8 +319,10 @@ def test_gltf_that_was_renamed_is_read_as_what_it_is(tmp_path, suffix):
 def test_packaged_files_have_their_short_names():
     assert len(io.read_body("ncs:body").vertices) == 6067
     assert len(io.read_garment("ncs:tshirt").vertices) and len(io.read_motion("ncs:walk").poses)
-    with pytest.raises(InputError, match="ncs:nobody: no such packaged file"):
-        io.read_body("ncs:nobody")
+    with pytest.raises(InputError, match="ncs:xyz: no such packaged file; use one of ncs:body, "):
+        io.read_body("ncs:xyz")
+    with pytest.raises(InputError, match=r"ncs:danse: no such packaged file; did you mean ncs:dance\?"):
+        io.read_motion("ncs:danse")
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])

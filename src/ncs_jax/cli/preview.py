@@ -57,8 +57,10 @@ def _say_bare(quantities: dict[str, float], thickness: float) -> None:
     deepest = max(quantities[f"{part}depth_max"] for part in ("", "middle_", "centre_"))
     frames = f"{quantities['bare']:.0f} of {quantities['measured']:.0f} frames that were measured"
     worst = f"{deepest:.1f} mm outside the cloth in frame {quantities['barest']:.0f}"
-    print(f"  skin shows by 1 mm in {frames}, at most {worst}: train longer")
-    print(f"  (--resume), on motions like this one, or with physics.collision.thickness above {1000 * thickness:g} mm")
+    print(f"  skin shows by 1 mm in {frames}, at most {worst}: train longer (--resume),")
+    print(
+        f"  on motions like it (--adapt 20 of ncs animate), or with physics.collision.thickness above {1000 * thickness:g} mm"
+    )
 
 
 def _is_trained_on(files: Sequence[str], name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 
 from ncs_jax.errors import InputError
@@ -16,8 +17,11 @@ def packaged(name: str, suffix: str = ".npz") -> Path:
     """Return the path of a file that comes with the package."""
     path = ASSETS / f"{name}{suffix}"
     if not path.is_file():
-        names = ", ".join(sorted(f"{SCHEME}{p.stem}" for p in ASSETS.glob(f"*{suffix}")))
-        raise InputError("no such packaged file", field=f"{SCHEME}{name}", mend=f"use one of {names}")
+        known = sorted(p.stem for p in ASSETS.glob(f"*{suffix}"))
+        near = next(iter(difflib.get_close_matches(name, known, n=1)), "")
+        names = ", ".join(f"{SCHEME}{other}" for other in known)
+        mend = f"did you mean {SCHEME}{near}? Else use one of {names}" if near else f"use one of {names}"
+        raise InputError("no such packaged file", field=f"{SCHEME}{name}", mend=mend)
     return path
 
 

@@ -110,12 +110,14 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
     if size > 3 * tall or size < tall / 30:
         raise InputError(
             f"a garment about the size of the body ({tall:.2f} m) expected", file=file, field="vertices",
-            value=f"{size:.3g} m", mend=_mend(garment, body) or "state its unit by garment.scale in the scene file",
+            value=f"{size:.3g} m",
+            mend=_mend(garment, body) or "bring it there by ncs fit, or state its unit by garment.scale in the scene file",
         )  # fmt: skip
     if gap > FAR * tall:
         raise InputError(
             "a garment that is on the body expected", file=file, field="vertices", value=f"{gap:.2f} m apart",
-            mend=_mend(garment, body) or "move it into the body's coordinates, or turn its axes to Y up: garment.up",
+            mend=_mend(garment, body)
+            or "bring it there by ncs fit, or move it into the body's coordinates, or turn its axes to Y up: garment.up",
         )  # fmt: skip
     if not axis_given and distance_outside(garment.vertices, body) > FAR:
         raw = garment.vertices @ TURNS[garment.up].T
@@ -140,7 +142,8 @@ def _mend(garment: GarmentRecord, body: np.ndarray) -> str:
                     words, fields = [UNITS[scale]], [f"scale = {scale:g}"]
                 if up != garment.up:
                     words, fields = [*words, f"{up.upper()} up"], [*fields, f'up = "{up}"']
-                return f"it looks like {', '.join(words)}: write {' and '.join(fields)} below [garment] in the scene file"
+                guess = f"it looks like {', '.join(words)}: write {' and '.join(fields)} below [garment] in the scene file"
+                return f"{guess}, or let ncs fit find its unit, axes and place"
     return ""
 
 

@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ncs_jax.errors import required
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.records import SkeletonPoses, shown_frames
+from ncs_jax.io.tables.files import replacing
 from ncs_jax.prepare.joint_names import side_and_rest
 from ncs_jax.prepare.posing import carried, joint_transforms, skinned
 from ncs_jax.prepare.setting import Setting
@@ -58,7 +59,8 @@ def motion_sheet(path: str | Path, setting: Setting, motions: Mapping[str, Motio
     sheet = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
     for number, row in enumerate(rows):
         sheet.paste(row, (0, number * row.height))
-    sheet.save(path, format="PNG")
+    with replacing(path) as part:
+        sheet.save(part, format="PNG")
 
 
 def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Image:

@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import cKDTree
 
 from ncs_jax.errors import InputError
+from ncs_jax.io.tables.files import replacing
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
@@ -187,7 +188,7 @@ def contact_sheet(
     tall = 1.10 * (high - low)
     wide = 1.10 * max(each[3] for row in bounds for each in row)
     width = round(tile * min(max(wide / tall, 0.40), 1.3))
-    margin, label = 56, 40
+    margin, label, fps = 56, 40, rows[0][2].animation.fps
     sheet = Image.new("RGB", (2 * margin + width * len(chosen), len(rows) * tile + 2 * label + margin), PAPER)
     draw = ImageDraw.Draw(sheet)
     for row, (name, _, stage) in enumerate(rows):
@@ -201,12 +202,12 @@ def contact_sheet(
         text = Image.new("L", (tile, label), 0)
         ImageDraw.Draw(text).text((tile / 2, label / 2), name.upper(), 255, _font(17), "mm")
         sheet.paste(FAINT, (8, top), text.rotate(90, expand=True))
-    fps = rows[0][2].animation.fps
     for column, frame in enumerate(chosen):
         x = margin + (column + 0.5) * width
         below = labels[column] if labels else f"{frame / fps:.2f} s"
         draw.text((x, label + len(rows) * tile + 22), below, INK, _font(22), "mm")
-    sheet.save(path, optimize=True)
+    with replacing(path) as part:
+        sheet.save(part, optimize=True)
 
 
 def animation_gif(
@@ -271,4 +272,5 @@ def _write_gif(path, pictures, seconds, colours):
     # A GIF counts in hundredths of a second: the rounding must not add up.
     ends = np.maximum.accumulate(np.round(np.arange(1, len(drawn) + 1) * seconds * 100)).astype(int)
     durations = [max(20, int(d) * 10) for d in np.diff(ends, prepend=0)]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=durations, loop=0, optimize=False, disposal=1)
+    with replacing(path) as part:
+        drawn[0].save(part, save_all=True, append_images=drawn[1:], duration=durations, loop=0, optimize=False, disposal=1)
