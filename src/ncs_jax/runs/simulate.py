@@ -114,7 +114,7 @@ def _follow(simulator: Simulator, settings: Settings, state: SimulationState, ma
 
 
 def _frame(simulator: Simulator, settings: Settings, state: SimulationState, matrices, k: int):
-    """Return the state and the vertices of frame k; the first one follows the body from rest into its pose, and comes to rest."""
+    """Return the state and the vertices of frame k; in the first the garment follows the body from rest, and comes to rest."""
     if k:
         return _follow(simulator, settings, state, matrices[k], settings.iterations, still=False)
     for n, pose in enumerate(walk_in(simulator.model.skeleton, matrices[0])):
