@@ -48,8 +48,7 @@ def _still(model: Model, matrices: Array) -> tuple[Problem, Array]:
     model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
     transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
     step = step_inputs(model, matrices, Past(rest, rest, moving=jnp.zeros((), rest.dtype)), transforms=transforms)
-    points = None if model.surface is None else model.surface.points
-    return Problem(model, couplings_from(model.garment.mesh, points), None, step), transforms
+    return Problem(model, couplings_from(model.garment.mesh, model.points), None, step), transforms
 
 
 @jax.jit
