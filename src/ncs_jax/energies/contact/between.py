@@ -40,7 +40,8 @@ def with_between(
     seen, weights = [x[len(index) :, i] for i in range(3)], points.weights.astype(table.rest.dtype)
     rest = [table.rest[:, i].at[own].get(mode="promise_in_bounds") for i in range(3)]
     corners = [points.corners[:, k] for k in range(3)]
-    middle = [sum(weights[:, k, None] * r[corners[k]] for k in range(3)) for r in rest]
+    parts = [[weights[:, k, None] * r[corners[k]] for k in range(3)] for r in rest]
+    middle = [a + b + c for a, b, c in parts]
     best = looked_up(table, middle)
     least = _square(seen, places(best))
     near = places(own)

@@ -39,7 +39,8 @@ def halfway_from(body: np.ndarray) -> Halfway:
     centres = [low[i] + size * (np.arange(shape[i]) + 0.5) for i in range(3)]
     grid = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1)
     nearest = tree.query(grid)[1].astype(np.int32)
-    return Halfway(*(jnp.asarray(a, jnp.float32) for a in (body, low, size)), jax.device_put(nearest))
+    rest, corner, width = (jnp.asarray(a, jnp.float32) for a in (body, low, size))
+    return Halfway(rest, corner, width, jax.device_put(nearest))
 
 
 def looked_up(table: Halfway, place: list[Float[Array, "points poses"]]) -> Int[Array, "points poses"]:
