@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from ncs_jax import io
 from ncs_jax.geometry.surface_distance import border_of
 from ncs_jax.prepare.covering import LOAD, SPARE, contact_for, least_thickness, sinking, vertex_share
+from ncs_jax.prepare.fit import fit
 from ncs_jax.prepare.scene_checks import find_risks
 from ncs_jax.runs.run import assemble
-from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.spec import CollisionSpec, load_scene
 
 from .scenes import SCENE, write_scene
 from .shapes import tube
@@ -57,6 +59,27 @@ def test_the_contact_holds_the_load_of_a_vertex_at_its_least_thickness():
     assert (fine.thickness, fine.stiffness) == (0.004, 10.0)
     given = contact_for(x, faces, sunk, 0.001)
     assert given.thickness == 0.001 < given.least
+
+
+def test_contact_between_vertices_asks_for_less():
+    """Of n pieces an edge, each sinks by a square of n less and bears as much less."""
+    x, faces = tube(12, 6, 0.1, 0.4)
+    pieces = np.full(len(faces), 2)
+    assert vertex_share(x, faces, pieces) == pytest.approx(vertex_share(x, faces) / 4)
+    assert contact_for(x, faces, 0.003, pieces=pieces).stiffness < contact_for(x, faces, 0.003).stiffness
+    assert vertex_share(x, faces, pieces[:0]) == vertex_share(x, faces)
+
+
+def test_a_fit_asks_for_less_where_its_scene_looks_between_vertices(monkeypatch):
+    skin, around = tube(64, 40, 0.08, 0.5)
+    weights = np.ones((len(skin), 1), np.float32)
+    body = io.BodyRecord(skin, around, np.zeros((1, 3)), np.array([-1], np.int32), weights)
+    cloth = io.GarmentRecord(tube(10, 6, 0.09, 0.3)[0] + [0, 0.1, 0], tube(10, 6, 0.09, 0.3)[1])
+    found = {}
+    for points in ("0", "auto"):
+        monkeypatch.setattr("ncs_jax.prepare.fit.CollisionSpec", lambda points=points: CollisionSpec(points=points))
+        found[points] = fit("g.npz", cloth, body, move=(0, 0, 0)).contact
+    assert found["auto"].thickness < found["0"].thickness and found["auto"].stiffness < found["0"].stiffness
 
 
 def test_a_border_is_where_a_mesh_ends():

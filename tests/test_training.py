@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ncs_jax.energies.contact.between import with_between
+from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.energies.total import energy_terms
@@ -55,13 +57,14 @@ def test_single_precision_energies_agree_with_a_plain_double_precision_reference
     for i in range(len(poses)):
         at = ([np.float64(table)[..., i] for table in group] for group in (matrices, offsets))
         expected, x, body, normals = jax.device_get(one(exact, *at))
-        points = exact.surface.points
-        x = np.concatenate([x, np.einsum("pk,pki->pi", points.weights, x[np.asarray(points.corners)])])
-        apart = x[:, None] - body[None]
-        nearest = np.argmin(np.linalg.norm(apart, axis=-1), axis=1)
-        distance = np.sum(normals[nearest] * apart[np.arange(len(x)), nearest], axis=-1)
+        surface, verts = exact.surface, len(x)
+        nearest = np.argmin(np.linalg.norm(x[:, None] - body[None], axis=-1), axis=1).astype(np.int32)
+        x = with_points(x, surface.points)
+        nearest = np.asarray(with_between(jnp.asarray(x), jnp.asarray(body), jnp.asarray(nearest), surface))
+        assert len(x) > verts
+        distance = np.sum(normals[nearest] * (x - body[nearest]), axis=-1)
         short = np.minimum(distance - float(exact.material.thickness), 0)
-        expected["collision"] = float(exact.material.collision) * np.sum(points.shares * short**2)
+        expected["collision"] = float(exact.material.collision) * np.sum(short**2)
         assert expected.keys() == fast.keys() and expected["collision"] > 0
         for name, value in expected.items():
             np.testing.assert_allclose(fast[name][i], value, rtol=1e-5, err_msg=name)

@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import bending
+from ncs_jax.energies.contact.between import with_between
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import nearest_distance, plane_distance
 from ncs_jax.energies.contact.friction import friction
@@ -45,19 +46,19 @@ def distances(
         return nearest_distance(x, body, surface, exact=terms.exact)
     if terms.collision == "smooth":
         return blended_contact(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
-    index, _ = nearest_vertex(x, body, surface, exact=terms.exact)
+    index, _ = nearest_vertex(x[: surface.verts], body, surface, exact=terms.exact)
+    index = with_between(x, body, index, surface)
     return plane_distance(x, body, vertex_normals(body, surface) if normals is None else normals, index)
 
 
 def body_collision(x, body, surface: Surface, terms: Terms, material: Material, normals=None) -> Float[Array, "*poses"]:
     """Return the energy of collision with the body (12) in J, by the scene's query; x (verts, 3, *poses), m."""
-    points = surface.points
-    x, shares = with_points(x, points), None if points is None else points.shares
+    if surface.points is not None:  # worked out once, and not again by each of what reads it
+        x = lax.optimization_barrier(with_points(x, surface.points))
     if terms.collision == "smooth":
         near = nearby_quadrics(x, body, surface)
-        lost = blended_contact(x, near, surface, material.thickness).shortfall
-        return material.collision * jnp.sum(lost if shares is None else shares.astype(lost.dtype) * lost)
-    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision, shares)
+        return material.collision * jnp.sum(blended_contact(x, near, surface, material.thickness).shortfall)
+    return collision(distances(x, body, surface, terms, normals), material.thickness, material.collision)
 
 
 def contact_force(

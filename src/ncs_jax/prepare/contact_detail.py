@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from ncs_jax import io
-from ncs_jax.energies.contact.points import MOST
 from ncs_jax.geometry.skinning import blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 
-__all__ = ["SPARE", "bent_most", "pieces_of", "posed_skins", "sags"]
+__all__ = ["FINEST", "SPARE", "bent_most", "pieces_of", "posed_skins", "sags"]
 
-SPARE = 0.5  # of the thickness: what cloth may sink between points of contact
+FINEST = 2  # pieces that an edge is cut into, at most
+SPARE = 0.75  # of the thickness: what cloth may sink between points of contact
 RING = (0.7, 1.5)  # how far from a vertex of the body its curve is looked at, in circumradii of a triangle
 MANY = 0.9  # of the skin near a triangle curves no more than it is ready for
 QUANTILE = 0.75  # of what a ring falls: its axis' direction falls nothing, and across it everything
@@ -50,7 +50,7 @@ def sags(skin: np.ndarray, faces: np.ndarray, edge: float) -> np.ndarray:
 def pieces_of(
     x: np.ndarray, faces: np.ndarray, skins: Sequence[np.ndarray], skin_faces: np.ndarray, thickness: float
 ) -> np.ndarray:
-    """Return into how many pieces contact cuts the edges of each triangle (F,), 1 to `MOST`: as few as leave enough thickness.
+    """Return into how many pieces contact cuts the edges of each triangle (F,): as few as leave thickness, `FINEST` at most.
 
         n = ceil(sqrt(s / (`SPARE` eps))),   as a triangle cut into n^2 sinks by s / n^2
 
@@ -71,7 +71,7 @@ def pieces_of(
     away, _ = tree.query(centres)
     near = tree.query_ball_point(centres, away + edges)
     deepest = np.array([np.quantile(sunk[some], MANY) if some else 0.0 for some in near]) * (edges / usual) ** 2
-    return np.clip(np.ceil(np.sqrt(deepest / (SPARE * thickness))), 1, MOST).astype(np.int8)
+    return np.clip(np.ceil(np.sqrt(deepest / (SPARE * thickness))), 1, FINEST).astype(np.int8)
 
 
 def bent_most(poses: np.ndarray) -> np.ndarray:

@@ -79,10 +79,11 @@ def _edges(corners: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
 
 
-def vertex_share(x: np.ndarray, faces: np.ndarray) -> float:
-    """Return the mean area of a vertex, m^2."""
+def vertex_share(x: np.ndarray, faces: np.ndarray, pieces: np.ndarray | None = None) -> float:
+    """Return the mean area of a vertex, or of a vertex and a point where `pieces` say that contact cuts triangles, m^2."""
     double = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
-    return float(np.linalg.norm(double, axis=1).sum() / 2 / len(np.unique(faces)))
+    share = np.linalg.norm(double, axis=1).sum() / 2 / len(np.unique(faces))
+    return float(share if pieces is None or not pieces.size else share / np.mean(pieces.astype(float) ** 2))
 
 
 def least_thickness(sunk: float, share: float, stiffness: float) -> float:
@@ -96,15 +97,17 @@ def least_thickness(sunk: float, share: float, stiffness: float) -> float:
     return sunk + LOAD * share / (2 * stiffness)
 
 
-def contact_for(x: np.ndarray, faces: np.ndarray, sunk: float, thickness: float | None = None) -> Cover:
+def contact_for(
+    x: np.ndarray, faces: np.ndarray, sunk: float, thickness: float | None = None, pieces: np.ndarray | None = None
+) -> Cover:
     """Return the contact that keeps the skin covered by a garment, in round numbers, and never below the defaults.
 
         k = P a / (2 p),    eps = 1.5 (s + P a / (2 k)),    p = `PRESSED`
 
     Args:
-        x: (V, 3), faces (F, 3), m. sunk: of `sinking`, m. thickness: if given, this one is kept, m.
+        x: (V, 3), faces (F, 3), m. sunk: of `sinking`, m. thickness: if given, this one is kept, m. pieces: as in `sinking`.
     """
-    usual, share = CollisionSpec(), vertex_share(x, faces)
+    usual, share = CollisionSpec(), vertex_share(x, faces, pieces)
     stiffness = max(usual.stiffness, 5.0 * math.ceil(LOAD * share / (2 * PRESSED) / 5 - 1e-9))
     least = least_thickness(sunk, share, stiffness)
     if thickness is None:

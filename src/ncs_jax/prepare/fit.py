@@ -14,10 +14,12 @@ from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.contact_detail import pieces_of
 from ncs_jax.prepare.covering import Cover, contact_for, sinking
 from ncs_jax.prepare.garment_checks import FAR, check_apart
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
+from ncs_jax.scene.spec import CollisionSpec
 
 __all__ = ["PINS", "Fitted", "bring_apart", "fit", "pins_of", "push_out", "settle"]
 
@@ -66,7 +68,11 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
     placement.check(file)
     placed = placement.garment
     before = placed.vertices.astype(np.float64)
-    contact = contact_for(before, placed.faces, sinking(before, placed.faces, body.vertices, body.faces), clearance)
+    pieces, usual = None, CollisionSpec()  # the scene's that is written
+    if usual.points == "auto":
+        pieces = pieces_of(before, placed.faces, [body.vertices], body.faces, clearance or usual.thickness)
+    sunk = sinking(before, placed.faces, body.vertices, body.faces, pieces)
+    contact = contact_for(before, placed.faces, sunk, clearance, pieces)
     x = push_out(before, placed.faces, body, contact.thickness)
     x = bring_apart(x, placed.faces, body, contact.thickness)
     farthest = float(np.linalg.norm(x - before, axis=1).max())

@@ -150,9 +150,9 @@ def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
     if collision.stiffness == 0:
         return
     rest, own = np.asarray(model.garment.mesh.rest, np.float64), np.asarray(model.garment.mesh.faces)
-    below = resting_body(model)
-    wanted = contact_for(rest, own, sinking(rest, own, below, faces, a.prepared.pieces))
-    pressed = least_thickness(0.0, vertex_share(rest, own), collision.stiffness)
+    below, pieces = resting_body(model), a.prepared.pieces
+    wanted = contact_for(rest, own, sinking(rest, own, below, faces, pieces), pieces=pieces)
+    pressed = least_thickness(0.0, vertex_share(rest, own, pieces), collision.stiffness)
     if wanted.sinking < FLAT or collision.thickness >= wanted.sinking + pressed:
         return
     thick, edge, sunk, deeper = (f"{1000 * a:.3g} mm" for a in (collision.thickness, wanted.edge, wanted.sinking, pressed))

@@ -93,8 +93,7 @@ def surface_of(
         frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
         poses = list(zip(*map(np.asarray, _worn(model, track.matrices[frames])), strict=True))
     rest, body = np.asarray(model.garment.mesh.rest), resting_body(model)
-    mesh = model.garment.mesh
-    points = contact_points(np.asarray(mesh.faces), np.asarray(mesh.face_area), pieces, len(rest)) if pieces.size else None
+    points = contact_points(np.asarray(model.garment.mesh.faces), pieces) if pieces.size else None
     return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.contact.points import ContactPoints
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
 from ncs_jax.errors import InputError, required, shaped
@@ -96,6 +97,11 @@ class Model:
     vibrations: RitzModes | None = None  # where the network swings along them
     under: tuple[Layer, ...] = ()  # garments worn below this one
     correctives: Correctives | None = None
+
+    @property
+    def points(self) -> ContactPoints | None:
+        """Return the points between the garment's vertices at which contact looks too, where there are some."""
+        return None if self.surface is None else self.surface.points
 
     def with_terms(self, terms: Sequence[OwnTerm]) -> Model:
         """Return the model with terms of one's own beside the scene's: see `energies.terms.OwnTerm`.

@@ -77,7 +77,7 @@ class Simulation(NamedTuple):
 
 def simulator_from(model: Model) -> Simulator:
     """Precompute a model's couplings and order of elimination."""
-    couplings = couplings_from(model.garment.mesh, None if model.surface is None else model.surface.points)
+    couplings = couplings_from(model.garment.mesh, model.points)
     return Simulator(model, couplings, elimination(np.asarray(couplings.pairs), np.asarray(model.garment.mesh.rest)))
 
 

@@ -47,7 +47,7 @@ LEAST = 0.1  # cycles a second: what is softer than that hangs on nothing; of ga
 
 
 def _couplings(model: Model) -> Couplings:
-    return couplings_from(model.garment.mesh, None if model.surface is None else model.surface.points)
+    return couplings_from(model.garment.mesh, model.points)
 
 
 def _still(model: Model, couplings: Couplings, matrices: Array) -> tuple[Problem, Array]:

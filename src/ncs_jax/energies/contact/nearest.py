@@ -131,7 +131,8 @@ def _candidates(x, features, blocks, lists, surface, squared):
     The gap between the two bounding boxes bounds every distance between two groups from below: a vertex whose nearest
     candidate is closer than the gap to every group that is not listed has the right one for certain.
     """
-    cloth = [component[surface.cloth_blocks] for component in x]  # (cloth groups, lanes, *poses)
+    own = surface.cloth_blocks[: lists.shape[1]]
+    cloth = [component[own] for component in x]  # (cloth groups, lanes, *poses)
     listed = jnp.zeros((len(blocks), lists.shape[1]), bool).at[lists, jnp.arange(lists.shape[1])].set(True)
     grouped = features[blocks]  # (groups, size, ..., 3, *poses)
     points = jnp.moveaxis(grouped, features.ndim - x[0].ndim + 1, 0).reshape(3, len(blocks), -1, *x[0].shape[1:])
@@ -146,9 +147,9 @@ def _candidates(x, features, blocks, lists, surface, squared):
         return best, None
 
     best = lax.scan(step, _farthest(cloth[0].shape, cloth[0].dtype), lists)[0]
-    rows = (-1, *x[0].shape[1:])
+    rows, place = (-1, *x[0].shape[1:]), surface.cloth_place[: len(x[0])]
     proven = best.real <= bound[:, None]
-    return _name(best).reshape(rows)[surface.cloth_place], proven.reshape(rows)[surface.cloth_place]
+    return _name(best).reshape(rows)[place], proven.reshape(rows)[place]
 
 
 def _repair(x, name, proven, features, squared, many, size=32):
@@ -194,7 +195,7 @@ def _search(x, features, groups: _Groups, surface, squared, many, exact):
 def nearest_vertex(
     x: Float[Array, "verts 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
 ) -> tuple[Int[Array, "verts *poses"], Bool[Array, "verts *poses"]]:
-    """Find the nearest body vertex of every cloth vertex, and whether the candidates alone prove it.
+    """Find the nearest body vertex of every cloth vertex, and whether the candidates alone prove it; of no points between them.
 
     With `exact` the rest is searched in full, so the answer is that of a full search whatever the pose; without it the
     candidates' best stands, and the second result tells which answers are certain. At most one axis of poses.

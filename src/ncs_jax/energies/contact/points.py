@@ -18,59 +18,41 @@ WHOLE = 12  # in which every number of pieces is contained
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ContactPoints:
-    """Points of a garment's triangles, beside its vertices, and what each of both counts in contact.
+    """Points of a garment's triangles at which contact looks as it does at vertices.
 
         x_p = sum_k w_pk x_k,   k the corners of p's triangle
 
-    weights: w, which add up to 1; zero for the corner across from an edge that holds the point. shares: of the vertices, then
-    of the points, in vertices: they add up to the number of vertices, see `contact_points`.
+    weights: w, which add up to 1; zero for the corner across from an edge that holds the point.
     """
 
     corners: Int[Array, "points 3"]
     weights: Float[Array, "points 3"]
-    shares: Float[Array, "all"]
 
 
-def contact_points(faces: np.ndarray, area: np.ndarray, pieces: np.ndarray, verts: int) -> ContactPoints | None:
+def contact_points(faces: np.ndarray, pieces: np.ndarray) -> ContactPoints | None:
     """Return the points that cut every edge of a triangle into so many pieces, and those inside; None where all are whole.
 
-        a_p = sum_f sum_k (A_f / sum_(g at k) A_g) 3 q_p w_pk,   q_p = c_p / (3 n^2)
-
-    Contact is the integral of its density over the cloth, taken by the trapezoidal rule: on whole triangles at their corners,
-    where each vertex counts 1; on a triangle cut into n^2 equal ones at theirs, c_p of which meet at p. A vertex shares what it
-    counts among the points of its triangles as its linear shape function does. So what is pressed in by the same depth
-    everywhere costs the same however it is cut.
+    They are the vertices that a finer mesh would have there, and as such each counts in contact as a vertex does. A point that
+    triangles share is there once.
 
     Args:
-        faces: (faces, 3) corners. area: (faces,) at rest, m^2. pieces: (faces,) n, from 1 to `MOST`. verts: of the garment.
+        faces: (faces, 3) corners. pieces: (faces,) from 1 to `MOST`.
     """
     faces, pieces = np.asarray(faces), np.asarray(pieces)
     if not (pieces > 1).any():
         return None
-    area = np.asarray(area, np.float64)
-    around = np.bincount(faces.ravel(), np.repeat(area, 3), verts)
-    count = np.bincount(faces.ravel(), minlength=verts)
-    of_corner = np.where(around[faces] > 0, area[:, None] / np.where(around > 0, around, 1)[faces], 1 / count[faces])
-    keys, owners, weights, shares = [], [], [], []
-    for n in np.unique(pieces):
+    keys, owners, weights = [], [], []
+    for n in np.unique(pieces[pieces > 1]):
         cut = np.flatnonzero(pieces == n)
         nodes = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)])
-        meet = np.array([6, 3, 1])[(nodes == 0).sum(axis=1)]
-        counts = np.einsum("fk,pk,p->fp", of_corner[cut], nodes / n, meet / n**2)
+        nodes = nodes[nodes.max(axis=1) < n]
         keys.append(_keys(faces[cut], nodes * (WHOLE // n)).reshape(-1, 6))
         owners.append(np.repeat(cut, len(nodes)))
         weights.append(np.tile(nodes / n, (len(cut), 1)))
-        shares.append(counts.ravel())
-    _, first, place = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
-    corners, carried = faces[np.concatenate(owners)][first], np.concatenate(weights)[first]
-    total = np.bincount(place.reshape(-1), np.concatenate(shares))
-    vertex, between = carried.max(axis=1) == 1, carried.max(axis=1) < 1
-    own = np.ones(verts)  # of a vertex without a triangle
-    own[corners[vertex, carried[vertex].argmax(axis=1)]] = total[vertex]
+    _, first = np.unique(np.concatenate(keys), axis=0, return_index=True)
     return ContactPoints(
-        corners=jax.device_put(corners[between].astype(np.int32)),
-        weights=jnp.asarray(carried[between]),
-        shares=jnp.asarray(np.concatenate([own, total[between]])),
+        corners=jax.device_put(faces[np.concatenate(owners)][first].astype(np.int32)),
+        weights=jnp.asarray(np.concatenate(weights)[first]),
     )
 
 

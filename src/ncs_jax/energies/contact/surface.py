@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ncs_jax.energies.contact.halfway import Halfway, halfway_from
 from ncs_jax.energies.contact.points import ContactPoints, with_points
 from ncs_jax.geometry.mesh import corners, topology, vertex_rings
 from ncs_jax.geometry.numerics import normalize
@@ -24,9 +25,10 @@ class Surface:
     """What collision needs to know once about the part of the body that a garment can touch.
 
     `cloth_blocks`, `vertex_blocks` and `face_blocks` are compact groups of cloth vertices, body vertices and body faces,
-    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. Of cloth with `points`
-    between its vertices these follow the vertices, as in `points.with_points`. `vertex_lists` and
-    `face_lists` name the body groups that each cloth group searches first.
+    the last entry repeated where a group is short; `cloth_place` finds a cloth vertex in its group. `vertex_lists` and
+    `face_lists` name the body groups that each cloth group searches first. Of cloth with `points` between its `verts` vertices
+    these follow the vertices, as in `points.with_points`: in groups of their own, which the search for vertices leaves out; or,
+    for smooth contact, among the vertices.
     """
 
     faces: Int[Array, "faces 3"]
@@ -37,12 +39,14 @@ class Surface:
     cloth_blocks: Int[Array, "blocks size"]
     cloth_place: Int[Array, "verts"]
     vertex_blocks: Int[Array, "clusters vertices"]
-    vertex_lists: Int[Array, "near_clusters blocks"]
+    vertex_lists: Int[Array, "near_clusters own_blocks"]
     face_blocks: Int[Array, "groups triangles"]
     face_lists: Int[Array, "near_groups blocks"]
     spacing: Float[Array, ""]  # mean edge length of the resting body, m
     groups: int = field(metadata={"static": True})  # how many body groups a cloth group looks at
+    verts: int = field(metadata={"static": True})  # of the cloth
     points: ContactPoints | None = None  # of the cloth, where contact looks between its vertices too
+    halfway: Halfway | None = None  # of the body, where there are some
 
 
 def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
@@ -57,6 +61,16 @@ def compact_groups(points: np.ndarray, size: int) -> np.ndarray:
         groups = [g for g in halves if len(g)]
     largest = max(len(g) for g in groups)
     return np.stack([np.pad(g, (0, largest - len(g)), mode="edge") for g in groups]).astype(np.int32)
+
+
+def _cloth_blocks(cloth, verts: int, size: int) -> tuple[np.ndarray, int]:
+    """Groups of the first `verts` of the cloth, then of the others, as wide as the widest; and how many the first are."""
+    own = compact_groups(cloth[:verts], size)
+    if len(cloth) == verts:
+        return own, len(own)
+    both = own, verts + compact_groups(cloth[verts:], size)
+    widest = max(blocks.shape[1] for blocks in both)
+    return np.concatenate([np.pad(b, ((0, 0), (0, widest - b.shape[1])), mode="edge") for b in both]), len(own)
 
 
 def _boxed(points, blocks):
@@ -81,8 +95,8 @@ def _lists(posed, cloth_blocks, body_blocks, count) -> np.ndarray:
 
 def rebuild_lists(surface: Surface, posed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surface:
     """Return the surface with new candidate lists for the nearest-vertex search, from poses [(cloth, body)]."""
-    posed = [(with_points(cloth, surface.points), body) for cloth, body in posed]
-    lists = _lists(posed, np.asarray(surface.cloth_blocks), np.asarray(surface.vertex_blocks), surface.groups)
+    own = np.asarray(surface.cloth_blocks)[: surface.vertex_lists.shape[1]]
+    lists = _lists(posed, own, np.asarray(surface.vertex_blocks), surface.groups)
     return replace(surface, vertex_lists=jax.device_put(lists))
 
 
@@ -102,12 +116,12 @@ def surface_from(
     balance of what a group looks at, what it proves at once and what is left to be searched in full (a coarse garment: smaller
     groups that look at more, since its far corners leave less proved). `points`: between the cloth's vertices.
     """
-    fine = (16, 8, 32) if len(cloth) >= 2048 else (8 if points is None else 16, 8, 64)
-    cloth, posed = with_points(np.asarray(cloth), points), [(with_points(cloth, points), body) for cloth, body in posed]
-    cloth_size, body_size, groups = (24, 4, 40) if smooth else fine
-    cloth_size = max(8, min(cloth_size, len(cloth) // (128 if smooth else 64)))
+    verts, cloth = len(cloth), with_points(np.asarray(cloth), points)
+    posed = [(with_points(np.asarray(x), points), skin) for x, skin in posed]
+    cloth_size, body_size, groups = (24, 4, 40) if smooth else (16, 8, 32) if verts >= 2048 else (8, 8, 64)
+    cloth_size = max(8, min(cloth_size, (len(cloth) if smooth else verts) // (128 if smooth else 64)))
     body, faces = np.asarray(body), np.asarray(faces)
-    cloth_blocks = compact_groups(cloth, cloth_size)
+    cloth_blocks, own = _cloth_blocks(cloth, len(cloth) if smooth else verts, cloth_size)
     vertex_blocks, face_blocks = compact_groups(body, body_size), compact_groups(body[faces].mean(axis=1), body_size)
     place = np.zeros(len(cloth), np.int32)
     place[cloth_blocks.reshape(-1)] = np.arange(cloth_blocks.size)
@@ -128,12 +142,14 @@ def surface_from(
         cloth_blocks=jax.device_put(cloth_blocks),
         cloth_place=jax.device_put(place),
         vertex_blocks=jax.device_put(vertex_blocks),
-        vertex_lists=jax.device_put(_lists(posed, cloth_blocks, vertex_blocks, groups)),
+        vertex_lists=jax.device_put(_lists(posed, cloth_blocks[:own], vertex_blocks, groups)),
         face_blocks=jax.device_put(face_blocks),
         face_lists=jax.device_put(_lists(posed, cloth_blocks, faces[face_blocks], groups)),
         spacing=jnp.asarray(np.linalg.norm(body[edges[:, 0]] - body[edges[:, 1]], axis=1).mean(), jnp.float32),
         groups=groups,
+        verts=verts,
         points=points,
+        halfway=None if points is None else halfway_from(body),
     )
 
 

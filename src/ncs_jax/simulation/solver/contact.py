@@ -45,13 +45,11 @@ def evaluate_contact(
     """
     stiffness, points = material.collision, surface.points
     x = with_points(x, points)
-    shares = None if points is None else points.shares.astype(x.dtype)
     if terms.collision != "smooth":
         distance, back = jax.vjp(lambda x: distances(x, body, surface, terms), x)
         (normal,) = back(jnp.ones_like(distance))
-        energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness, shares)
+        energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness)
         pushing = jnp.where(distance < material.thickness, 2 * stiffness, 0)
-        pushing = pushing if shares is None else shares * pushing
         blocks = pushing[:, None, None] * normal[:, :, None] * normal[:, None, :]
         return Contact(energy, on_vertices(slope[:, None] * normal, points), blocks, distance)
     near = nearby_quadrics(x, body, surface) if near is None else near
@@ -63,9 +61,6 @@ def evaluate_contact(
         2 * stiffness * found.directions,
         found.distance,
     )
-    if shares is not None:
-        own = shares if only is None else shares.at[only].get(mode="fill", fill_value=0)
-        lost, gradient, blocks = own * lost, own[:, None] * gradient, own[:, None, None] * blocks
     if only is not None:
         gradient = jnp.zeros_like(x).at[only].set(gradient, mode="drop")
         blocks = jnp.zeros((*x.shape, 3), x.dtype).at[only].set(blocks, mode="drop")
