@@ -77,6 +77,11 @@ def test_a_check_compiles_next_to_nothing_and_loads_no_network(tmp_path):
     assert 0 < programs <= 10 and not heavy
 
 
+def found_anew(names, make, *given):
+    """In the place of `kept`: what a process before has found is not taken."""
+    return make()
+
+
 @pytest.mark.parametrize("person", ["terminal", "notebook", "nobody"])
 def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, capsys, person):
     """No vibration is really looked for, and the gated cell replaces the swing. A loaded IPython is no notebook yet."""
@@ -85,7 +90,7 @@ def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, c
     shell = types.SimpleNamespace(get_ipython=lambda: object() if person == "notebook" else None)
     monkeypatch.setitem(sys.modules, "IPython", shell)
     monkeypatch.setitem(sys.modules, "ipykernel", shell)
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    monkeypatch.setattr("ncs_jax.prepare.build.kept", found_anew)
     scene = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', "")))  # "auto": a swing, if there is one
     assemble(scene)
     said = capsys.readouterr().err
@@ -120,7 +125,7 @@ def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path
         return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), slope, drape=drape)
 
     monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    monkeypatch.setattr("ncs_jax.prepare.build.kept", found_anew)
     scene, begun = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))), []
     whole = assemble(scene, ahead=begun.append)
     assert not np.any(begun[0].model.vibrations.directions) and whole.model.vibrations.directions.size
@@ -141,7 +146,7 @@ def test_a_run_from_anothers_weights_looks_for_no_vibrations_where_garment_and_p
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
-        patch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+        patch.setattr("ncs_jax.prepare.build.kept", found_anew)
         first = assemble(load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))))
         start = Run(first, initial_state(first.model, first.network, 0).params)
         moving = swing()
