@@ -225,7 +225,7 @@ def _joints(file: File, setup: Setup, moved: np.ndarray) -> tuple[list[int], np.
     size, turns = np.cbrt(np.linalg.det(base[:3, :3])), Rotation.random(len(NAMES), random_state=3)
     flip = np.array([np.sign(size), 1, 1])
     rest = np.array([matrix(q, x, flip * abs(size) * setup.sizes) for q, x in zip(turns, JOINTS, strict=True)])
-    worlds, nodes = moved @ rest, []
+    worlds, nodes = moved @ rest, list[int]()
     for j, (name, parent) in enumerate(zip(NAMES, PARENTS, strict=True)):
         own = np.linalg.inv(base if parent < 0 else rest[parent]) @ rest[j]
         keys = np.linalg.inv(base if parent < 0 else worlds[:, parent]) @ worlds[:, j]
