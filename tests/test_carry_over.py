@@ -104,7 +104,7 @@ def test_what_is_strained_or_worn_worse_is_refused():
         (found, replace(after, pierced=("left_arm",))),
         (found, replace(after, threaded=0.5)),
     ):
-        with pytest.raises(InputError, match=r"g\.obj: vertices: two bodies of one kind expected.*--from"):
+        with pytest.raises(InputError, match=r"g\.obj: vertices: two bodies of one kind expected.*that it was made for"):
             bad.check("g.obj", before, there)
 
 

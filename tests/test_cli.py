@@ -20,7 +20,7 @@ from PIL import Image
 from rich.console import Console
 
 from ncs_jax import io
-from ncs_jax.cli import check, main, preview
+from ncs_jax.cli import animate, check, main, preview
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.cli.train import _TrainingBar
 from ncs_jax.io import MotionRecord
@@ -405,7 +405,7 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
     line = ["train", str(scene), "--out", str(out), "--resume"]
     for option, word in (("--preset", "fast"), ("--seed", "7"), ("--steps", "5"), ("--from", str(given))):
         assert main([*line, option, word]) == 2
-        one_line(capsys, [option.strip("-").replace("from", "start")])
+        one_line(capsys, [option.strip("-")])
     with monkeypatch.context() as patch:  # nothing is assembled anew, as its scene is there
         patch.setattr("ncs_jax.runs.train.assemble_run", None)
         assert main([*line, "--steps", "10"]) == 0
@@ -436,6 +436,13 @@ def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, caps
         if len(shown) == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
+    def early(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ncs_jax.runs.train.assemble_run", early)
+        assert main(["train", str(scene), "--out", str(out), "--steps", "100"]) == 130
+    assert capsys.readouterr().err == "ncs: interrupted before the first step: the same command begins again\n"
     monkeypatch.setattr(_TrainingBar, "show", pressed)
     assert main(["train", str(scene), "--out", str(out), "--steps", "100"]) == 130
     said = capsys.readouterr()
@@ -443,7 +450,8 @@ def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, caps
     assert said.err == f"ncs: interrupted; `ncs train {scene} --out '{out}' --resume` goes on from the last checkpoint\n"
     assert shown == [10, 20] and load_run(out).steps == 30
     assert main(["train", str(scene), "--out", str(out), "--resume", "--steps", "40"]) == 0
-    assert "step 40/40" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "going on from step 30" in said and "step 40/40" in said
 
 
 def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, monkeypatch):
@@ -691,6 +699,19 @@ def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, 
     one_line(capsys, ["other.npz: frames", "(2, 30)"])
     assert main(["animate", str(folder), "--out", "d.gif"]) == 2
     one_line(capsys, ["d.gif", ".npz"])
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_animate_tells_in_a_line_how_a_motion_was_brought_onto_the_skeleton(capsys, monkeypatch, whole):
+    monkeypatch.setattr("ncs_jax.prepare.scene_checks.motion_risks", lambda _: [])
+    retargeted = "retargeted by joint names, 3 of the body's 4 joints are driven, of these by one of another name: a by b"
+    notes = ("its take walk is read", retargeted, "the lowest sole is as high as at rest")
+    motions = {"many": SimpleNamespace(notes=notes), "one": SimpleNamespace(notes=notes[:1]), "none": SimpleNamespace(notes=())}
+    animate._tell_motions(SimpleNamespace(motions=motions), whole)
+    said = capsys.readouterr().out.splitlines()
+    line = "retargeted by joint names, 3 of the body's 4 joints are driven; --notes prints all 3 lines on it"
+    expected = ["motion    " + notes[0], *(" " * 10 + note for note in notes[1:])] if whole else ["motion    " + line]
+    assert said == [f"  {words}" for words in (*expected, "motion    " + notes[0])]
 
 
 @pytest.mark.parametrize("file", ["run.json", "prepared.npz"])

@@ -56,7 +56,11 @@ def test_a_pose_beyond_is_told_with_its_frame_and_joint(known):
     chord = np.sqrt(2) * 2 * np.sin(0.4)
     assert np.isclose(found.poses.max() * FAR, chord, rtol=0.05)
     assert found.told and found.excess > TOLD and np.array_equal(found.outside, found.distance > 1)
-    assert f"{found.share:.0%} of the frames" in str(found) and "joint" not in str(found) and "--adapt 20" in str(found)
+    assert (
+        f"{found.share:.0%} of the frames" in str(found)
+        and "joint" not in str(found)
+        and "--adapt 20 (in Python ncs_jax.adapt)" in str(found)
+    )
     facts = found.facts()
     assert facts["worst"] == {"frame": found.worst[0], "joint": "1", "by": "pose"} and facts["told"] is True
 

@@ -121,7 +121,7 @@ def test_what_has_no_rule_is_named(function, word):
 
 def test_the_opset_and_the_package(monkeypatch):
     for opset in (12, 22):
-        with pytest.raises(InputError, match=rf"--opset: 13 to 21 expected \(found {opset}\)"):
+        with pytest.raises(InputError, match=rf"^opset: 13 to 21 expected \(found {opset}\)"):
             made(FUNCTIONS["a sum"][0], opset=opset)
     assert made(FUNCTIONS["a sum"][0], opset=13).opset_import[0].version == 13
     assert made(FUNCTIONS["a sum"][0], facts="told").metadata_props[0].value == "told"

@@ -119,6 +119,6 @@ def test_own_network(tmp_path, whole):
         _, printed = ran_small("own_network", tmp_path, SHORT, *hung(tmp_path, FREE))
     every = "".join(printed)
     counts = [int(line.split(": ")[1].split()[0]) for line in every.splitlines() if "parameters" in line]
-    assert "TanhEncoder: a code of" in every
+    assert "TanhEncoder: a code of" in every and "sines: 20 steps, then 40;" in every
     assert len(set(counts)) == 2 and (not whole or counts[1] < counts[0] / 2)
     assert float(every.split("largest difference ")[1].split()[0]) < 1e-5

@@ -152,8 +152,10 @@ def test_without_them_the_program_is_the_same(folder, plain_jax):
 def test_a_network_of_ones_own(folder, tmp_path, plain_jax):
     run = ncs_jax.train(scene(folder), tmp_path / "run", steps=10, network=plain)
     motion = str(folder / "swing.npz")
-    with pytest.raises(InputError, match="plain"):
+    with pytest.raises(InputError, match=r"plain .*in Python, give network=\.\.\."):
         ncs_jax.load_run(tmp_path / "run")
+    with pytest.raises(InputError, match=r"network: weights of the shapes of a run .*in Python, network=\.\.\."):
+        ncs_jax.train(scene(folder), None, steps=10, start=run)
     again = ncs_jax.load_run(tmp_path / "run", network=plain)
     np.testing.assert_array_equal(again.animate(motion), run.animate(motion))
 

@@ -191,6 +191,7 @@ def test_the_packaged_body_and_motions_are_the_identity():
 
 QUARTER = Rotation.from_euler("y", 90, degrees=True).as_matrix()
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+X_UP = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
 @pytest.mark.parametrize("turn", [None, QUARTER, Z_UP], ids=["as ours", "faces +X", "Z up"])
@@ -210,6 +211,25 @@ def test_bones_point_where_the_sources_point(rng, theirs, droop, turn):
     ours, path = (0.42 + np.hypot(0.4, 0.02)) / (0.5 + np.hypot(0.4, 0.02)), motion.translation @ upright.T
     assert moved.scale == pytest.approx(ours / 40)
     np.testing.assert_allclose(np.diff(moved.motion.translation, axis=0), moved.scale * np.diff(path, axis=0), atol=1e-9)
+
+
+@pytest.mark.parametrize("world", ["y", "z"])
+@pytest.mark.parametrize("rest", ["zero", "2"])
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_motion_that_stands_along_x_drives_as_the_one_along_y(rng, world, rest, stands):
+    """At rest too, or turned there by its root alone; also where a frame is its reference pose."""
+    body, plain = body_of("smpl", droop=0.3), motion_of("cmu", rng, droop=0.9, amount=0.1)
+    poses, joints, root = plain.poses @ X_UP.T, plain.joints @ X_UP.T, Rotation.from_rotvec(plain.poses[:, 0])
+    if not stands:
+        poses, joints = plain.poses.copy(), plain.joints
+        poses[:, 0] = (Rotation.from_matrix(X_UP) * root).as_rotvec()
+    tipped = replace(plain, poses=poses, joints=joints, translation=plain.translation @ X_UP.T)
+    found, expected = (
+        retarget_to_body(m, body, replace(MotionSpec(), up=up, rest=rest), world) for m, up in ((tipped, "x"), (plain, "y"))
+    )
+    assert f"turned from X up to {world.upper()} up" in found.notes
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
+    np.testing.assert_allclose(np.diff(found.translation, axis=0), np.diff(expected.translation, axis=0), atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [QUARTER, QUARTER @ QUARTER, Z_UP, Z_UP @ QUARTER], ids=["+X", "-Z", "Z up", "Z up, +X"])
@@ -435,7 +455,7 @@ def test_a_bvh_drives_the_packaged_body_and_check_says_how(tmp_path, rng, capsys
 
 @pytest.mark.parametrize(
     ("motion", "words"),
-    [("frames = [1, 2, 3]", "motion.frames"), ("frames = [-1]", "motion.frames"), ('up = "x"', "motion.up"),
+    [("frames = [1, 2, 3]", "motion.frames"), ("frames = [-1]", "motion.frames"), ('up = "w"', "motion.up"),
      ("joints = 3", "motion.joints: a table"), ("joints = { a = 1.5 }", "motion.joints.a"), ("scale = -1", "motion.scale")],
 )  # fmt: skip
 def test_fields_of_a_scene_that_are_wrong(tmp_path, motion, words):

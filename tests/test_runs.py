@@ -135,7 +135,7 @@ def test_a_process_with_64_bits_trains_too(tmp_path, plain_jax):
 def test_a_run_is_not_overwritten(tmp_path, plain_jax):
     scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
     train(scene, out, steps=10)
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match=r"add resume=True, or choose another out$"):
         train(scene, out, steps=10)
     with pytest.raises(InputError, match="no run to resume"):
         train(scene, tmp_path / "other", steps=10, resume=True)
@@ -268,7 +268,7 @@ def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):
     with pytest.raises(InputError, match=r"a run keeps its seed .*found 5"):
         train(scene, out, seed=5, resume=True)
     scene.write_text(scene.read_text().replace("steps = 40", "steps = 40\nlearning_rate = 0.01"))
-    with pytest.warns(InputWarning, match=r"not taken: training.learning_rate; .*--from"):
+    with pytest.warns(InputWarning, match=r"not taken: training.learning_rate; .*weights: start "):
         train(scene, out, resume=True)
 
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -19,12 +20,14 @@ from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.geometry.surface_distance import closest_on_surface, distance_and_direction, signed_distance
 from ncs_jax.prepare.kept import kept
-from ncs_jax.runs.run import assemble
+from ncs_jax.runs.begin import assemble_run
+from ncs_jax.runs.run import Run, assemble
 from ncs_jax.scene.model import RitzModes
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.programs import Programs
+from ncs_jax.training.step import initial_state
 
-from .scenes import SCENE, write_scene
+from .scenes import SCENE, swing, write_scene
 
 SOURCE = str(Path(__file__).parents[1] / "src")
 WORDS = (["--help"], ["train", "--help"], ["train", "--wrong"], ["nothing"], ["check", "--fields"], ["check", "no.toml"])
@@ -74,6 +77,11 @@ def test_a_check_compiles_next_to_nothing_and_loads_no_network(tmp_path):
     assert 0 < programs <= 10 and not heavy
 
 
+def found_anew(names, make, *given):
+    """In the place of `kept`: what a process before has found is not taken."""
+    return make()
+
+
 @pytest.mark.parametrize("person", ["terminal", "notebook", "nobody"])
 def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, capsys, person):
     """No vibration is really looked for, and the gated cell replaces the swing. A loaded IPython is no notebook yet."""
@@ -82,7 +90,7 @@ def test_what_takes_long_is_told_to_a_person(tmp_path, plain_jax, monkeypatch, c
     shell = types.SimpleNamespace(get_ipython=lambda: object() if person == "notebook" else None)
     monkeypatch.setitem(sys.modules, "IPython", shell)
     monkeypatch.setitem(sys.modules, "ipykernel", shell)
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    monkeypatch.setattr("ncs_jax.prepare.build.kept", found_anew)
     scene = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', "")))  # "auto": a swing, if there is one
     assemble(scene)
     said = capsys.readouterr().err
@@ -117,7 +125,7 @@ def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path
         return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), slope, drape=drape)
 
     monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    monkeypatch.setattr("ncs_jax.prepare.build.kept", found_anew)
     scene, begun = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))), []
     whole = assemble(scene, ahead=begun.append)
     assert not np.any(begun[0].model.vibrations.directions) and whole.model.vibrations.directions.size
@@ -125,6 +133,37 @@ def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path
     flat = [jax.tree.flatten((a.model, a.training_features)) for a in (begun[0], whole)]
     kinds = [([(leaf.shape, leaf.dtype) for leaf in leaves], structure) for leaves, structure in flat]
     assert kinds[0] == kinds[1]
+
+
+def test_a_run_from_anothers_weights_looks_for_no_vibrations_where_garment_and_physics_are_the_same(tmp_path, plain_jax):
+    """They are that run's, and so is the network. With another material they are looked for."""
+    looked, draw = [], np.random.default_rng(0)
+
+    def found(model, track, count):
+        looked.append(model)
+        directions = jnp.asarray(draw.normal(size=(len(model.basis), 3, count)) / 100, jnp.float32)
+        return RitzModes(directions, jnp.float32(0.01), jnp.eye(count, dtype=jnp.float32), drape=directions[:, :, 0])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", found)
+        patch.setattr("ncs_jax.prepare.build.kept", found_anew)
+        first = assemble(load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"', 'cell = "swing"'))))
+        start = Run(first, initial_state(first.model, first.network, 0).params)
+        moving = swing()
+        moving["trans"][:, 0] += 0.1 * np.arange(len(moving["trans"]))
+        np.savez(tmp_path / "walk.npz", **moving)
+        other = replace(first.scene, motion=replace(first.scene.motion, files=(str(tmp_path / "walk.npz"),)))
+        assembly, _ = assemble_run(other, None, None, start, None, assemble)
+        assert len(looked) == 1
+        denser = replace(other, physics=replace(other.physics, density=0.3))
+        assembled, _ = assemble_run(denser, None, None, start, None, assemble)
+        assert len(looked) == 2
+    for a, b in zip(jax.tree.leaves(first.model.vibrations), jax.tree.leaves(assembly.model.vibrations), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(assembly.prepared.vibrations, first.prepared.vibrations)
+    assert np.any(assembled.prepared.vibrations != first.prepared.vibrations)
+    assert (assembly.network, assembly.scene.network) == (first.network, first.scene.network)
+    assert not np.array_equal(assembly.track.matrices, first.track.matrices)
 
 
 def ball(rows=9, around=14):

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
 
-__all__ = ["InputError", "InputWarning", "required", "shaped"]
+__all__ = ["InputError", "InputWarning", "for_python", "required", "shaped"]
+
+# What an option of the commands is called in Python, where that is not its own name.
+ARGUMENTS = {"from": "start", "adapt": "seconds", "resume": "resume=True", "float16": "float16=True", "stay": "move=(0, 0, 0)"}
+
+
+def for_python(text: str) -> str:
+    """Return a text that names options of the commands, as `--resume`, with the arguments in their place: `resume=True`.
+
+    What stands in backquotes, as a whole command, stays.
+    """
+    parts = text.split("`")
+    parts[::2] = [re.sub(r"(?<![\w-])--([a-z][a-z0-9-]*)", _argument, part) for part in parts[::2]]
+    return "`".join(parts)
+
+
+def _argument(option: re.Match) -> str:
+    return ARGUMENTS.get(option[1], option[1].replace("-", "_"))
 
 
 class InputError(ValueError):
     """A file, field or argument of the user's that cannot be used.
 
     The message is one line: the file, the field, what was expected, the value found and the mend. The commands print it and
-    exit with code 2.
+    exit with code 2. It is written in options of the commands, as `--out`, and kept so in `as_command`; the message itself,
+    which is for Python, names the arguments: see `for_python`.
     """
 
     def __init__(
@@ -30,11 +49,19 @@ class InputError(ValueError):
         where = ": ".join(str(part) for part in (file, field) if part not in (None, ""))
         found = "" if value is None else f" (found {_short(value)})"
         text = f"{where}: {expected}{found}" if where else f"{expected}{found}"
-        super().__init__(f"{text}; {mend}" if mend else text)
+        self.as_command = f"{text}; {mend}" if mend else text
+        super().__init__(for_python(self.as_command))
 
 
 class InputWarning(UserWarning):
-    """What a user gave can be used, but may not do what was meant. The commands print it as a line on stderr and go on."""
+    """What a user gave can be used, but may not do what was meant. The commands print it as a line on stderr and go on.
+
+    As an `InputError`, it is written in options of the commands, and Python shows the arguments.
+    """
+
+    def __init__(self, as_command: str) -> None:
+        self.as_command = as_command
+        super().__init__(for_python(as_command))
 
 
 def required(value: T | None, field: str, mend: str | None = None) -> T:

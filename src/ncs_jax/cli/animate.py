@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +46,7 @@ def add_commands(commands) -> None:
         "--rank", type=arguments.whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
     )
     parser.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
+    parser.add_argument("--notes", action="store_true", help="print all that was done to bring --motion onto the skeleton")
     parser.add_argument("--out", required=True, metavar="FILE", help=f"{arguments.FORMATS}; or .mp4, a video")
     parser.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
     parser.add_argument(
@@ -161,22 +163,27 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
     records = {name: run.motion(name) for name in motions}
     run = replace(run, assembly=replace(run.assembly, motions=records))
     if options.motion:
-        _tell_motions(run.assembly)
+        _tell_motions(run.assembly, options.notes)
     if options.adapt is not None:
         run = adapted(run, motions, options).run
     tell_beyond(run.coverage(records[motions[0]]))
     return run, records[motions[0]]
 
 
-def _tell_motions(assembly: Assembly) -> None:
-    """Print how the motions of an assembly drive the body, and what in them puts the animation at risk."""
+def _tell_motions(assembly: Assembly, whole: bool) -> None:
+    """Print what puts the animation at risk in the motions, and how they drive the body, in a line or as a whole."""
     from ncs_jax.cli.check import tell, tell_risk
     from ncs_jax.prepare.scene_checks import motion_risks
 
     for risk in motion_risks(assembly):
         tell_risk(risk)
     for motion in assembly.motions.values():
-        for number, note in enumerate(motion.notes):
+        notes = motion.notes
+        if not whole and len(notes) > 1:
+            first = next((note for note in notes if note.startswith("retargeted")), notes[0])
+            first = re.split(r"[;:]|, of these", first)[0]
+            notes = (f"{first[:100]}; --notes prints all {len(notes)} lines on it",)
+        for number, note in enumerate(notes):
             tell("" if number else "motion", note)
 
 

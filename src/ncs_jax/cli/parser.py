@@ -57,11 +57,14 @@ def main(arguments: list[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             return parsed.run(parsed)
     except InputError as error:
-        print(f"ncs: {error}", file=sys.stderr)
+        print(f"ncs: {error.as_command}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         given = {name: shlex.quote(value) for name, value in vars(parsed).items() if isinstance(value, str)}
-        print(f"ncs: interrupted{GOES_ON.get(parsed.run, '').format(**given)}", file=sys.stderr)
+        goes_on = GOES_ON.get(parsed.run, "").format(**given)
+        if parsed.run in (train.train, train.demo) and not (Path(parsed.out) / "run.json").exists():
+            goes_on = " before the first step: the same command begins again"
+        print(f"ncs: interrupted{goes_on}", file=sys.stderr)
         code = 130
     if getattr(parsed, "hosts", None) is not None:
         train.leave(code)
@@ -70,8 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
     """Print what a user's input may have done wrong as one line, and any other warning as Python does."""
-    told = issubclass(category, InputWarning)
-    text = f"ncs: warning: {message}\n" if told else warnings.formatwarning(message, category, filename, lineno, line)
+    told = isinstance(message, InputWarning)
+    text = (
+        f"ncs: warning: {message.as_command}\n" if told else warnings.formatwarning(message, category, filename, lineno, line)
+    )
     (file or sys.stderr).write(text)
 
 

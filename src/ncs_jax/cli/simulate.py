@@ -43,10 +43,10 @@ def simulate(options) -> int:
 
         def show(p):
             if p.compiling:
-                progress.say(f"compiling, then frame {p.frame + 1} of {p.frames}")
+                progress.begin(f"compiling, then frame {p.frame + 1} of {p.frames}")
                 return
             how = f"{p.iterations} iterations, {p.residual:.3g} g out of balance"
-            progress.show(f"frame {p.frame}/{p.frames}", p.frame, p.frames, how, left=p.left)
+            progress.show(f"frame {p.frame}/{p.frames}", p.frame, p.frames, how, left=p.left or None)
 
         result = runs_simulate.simulate(scene, options.motion, partial=partial, report=show)
     garment = result.assembly.garment
@@ -68,4 +68,6 @@ def simulate(options) -> int:
         if frames.size:
             worst = result.residual[frames].max()
             print(f"  {frames.size} frames not at tolerance: {text} (first: frame {frames[0]}, worst {worst:.3g} g)")
+    if result.status.any() and scene.physics.collision.distance == "plane":
+        print('  note: with physics.collision.distance = "plane" cloth may find no balance; "smooth" has one')
     return 0

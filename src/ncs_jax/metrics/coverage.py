@@ -106,7 +106,7 @@ class Coverage:
         frame, joint, what = self.worst
         text = f"{self.share:.0%} of the frames are beyond the poses and speeds that the run was trained on"
         text += f", frame {frame} most, by the {what} of {joint}"
-        return f"{text}; adapt it with --adapt 20, or train on such motion" if self.told else text
+        return f"{text}; adapt it with --adapt 20 (in Python ncs_jax.adapt), or train on such motion" if self.told else text
 
 
 def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:

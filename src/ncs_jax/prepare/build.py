@@ -37,6 +37,7 @@ __all__ = [
     "Assembly",
     "TrainingMotions",
     "build",
+    "check_static",
     "features_from_records",
     "tell_a_person",
     "training_features",
@@ -146,7 +147,7 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
-            _check_static(model, terms, known)  # before a minute is spent
+            check_static(model, terms, known)  # before a minute is spent
 
             def begin() -> None:
                 (report or tell_a_person)("finding the garment's vibrations, which may take a minute")
@@ -161,8 +162,12 @@ def build(
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track, training)
 
 
-def _check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
-    """Raise an InputError where a term of one's own does not do without a past; nothing is computed."""
+def check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
+    """See that terms of one's own do without a past, as a swing trains; nothing is computed.
+
+    Raises:
+        InputError: one does not.
+    """
     own, alone = model.with_terms(terms), Terms(None, False, None, gravity=False, inertia=False, own=tuple(terms))
 
     def energies(x, matrices):

@@ -74,7 +74,7 @@ class Carried:
         if doubt:
             raise InputError(
                 f"two bodies of one kind expected: {doubt}", file=file, field="vertices", value="as it was carried over",
-                mend="look at the picture; see that it lies on the body of --from as it was made, or drape it in a modeller",
+                mend="look at the picture; see that it lies well on the body that it was made for, or drape it in a modeller",
             )  # fmt: skip
 
 
@@ -136,13 +136,13 @@ def carry_over(garment: GarmentRecord, source: BodyRecord, target: BodyRecord, f
 def _maps(source: BodyRecord, target: BodyRecord, file: str | Path) -> tuple[np.ndarray, np.ndarray, _Parts, _Parts]:
     """Return the affine map (J, 3, 4) and the turn R (J, 3, 3) of each joint of the source, and the parts of both bodies."""
     limbs = []
-    for body in (source, target):
+    for body, which in ((source, "the source, `--from`"), (target, "the target, `--body`")):
         names = body_names(body)
         found = anatomy(names, body.parents.tolist(), body.joints) if names else Limbs({}, (), ())
         if missing := [role for role in NEEDED if role not in found.roles]:
             raise InputError(
                 "two bodies whose joints' names tell arms and legs expected", file=file, field="joint_names",
-                value=f"no {missing[0]} in {'--from' if body is source else '--body'}: {', '.join(names[:4]) or 'no names'}",
+                value=f"no {missing[0]} in {which}: {', '.join(names[:4]) or 'no names'}",
                 mend="name the joints as a common rig does, or drape the garment on this body in a modeller",
             )  # fmt: skip
         limbs.append(found)

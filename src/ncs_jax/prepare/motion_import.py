@@ -265,7 +265,7 @@ def _by_kind(faults: Mapping[str, InputError]) -> str:
     for names in sorted(kinds.values(), key=len, reverse=True)[:NAMED]:
         also = names[1 : NAMED + 1]
         more = f" and {len(names) - 1 - len(also)} more" if len(names) > 1 + len(also) else ""
-        lines.append(f"  {faults[names[0]]}" + (f"; so too {', '.join(also)}{more}" if also else ""))
+        lines.append(f"  {faults[names[0]].as_command}" + (f"; so too {', '.join(also)}{more}" if also else ""))
     return "\n".join(lines) + (f"\n  and {len(kinds) - NAMED} faults of other kinds" if len(kinds) > NAMED else "")
 
 

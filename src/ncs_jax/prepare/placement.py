@@ -59,7 +59,11 @@ class Placement:
                 "--scale and --up, or leave out --stay and --move, so that its place is found",
             )  # fmt: skip
         if self.doubt:
-            other = "if it was made for another body, name that by --from; " if self.pierced or self.threaded <= 0.99 else ""
+            other = (
+                "if it was made for another body, name that by `ncs fit --from`; "
+                if self.pierced or self.threaded <= 0.99
+                else ""
+            )
             raise InputError(
                 f"a garment that lies on the body expected: {self.doubt}", file=file, field="vertices",
                 value=f"as its best place {self.options}", mend=f"{other}if the picture is right, give these options; "

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io import MotionRecord
+from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.prepare.built_pose import FEWEST, UPRIGHT, build_pose
 from ncs_jax.prepare.joint_names import Limbs
 from ncs_jax.prepare.skeleton import (
@@ -243,9 +244,7 @@ def from_frame(motion: MotionRecord, of: Limbs, up: str, frame: int, note: str) 
     """Return the pose of a frame as the reference, turned about the vertical to look ahead."""
     one = replace(motion, poses=motion.poses[frame : frame + 1], translation=motion.translation[frame : frame + 1])
     turns, places = forward(one)
-    return Reference(
-        person_axes(places[0], of, up).T @ turns[0], note, places[0, 0] if up == "y" else places[0, 0, [0, 2, 1]] * (1, 1, -1)
-    )
+    return Reference(person_axes(places[0], of, up).T @ turns[0], note, places[0, 0] @ TURNS[up])
 
 
 def _at_end(last: MotionRecord, of: Limbs, up: str) -> Reference | None:

@@ -13,6 +13,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
+from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.records import SkeletonPoses, shown_frames
 from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
 from ncs_jax.prepare.skeleton import LIMBS, body_axes, bone, forward, least_turn, rest_of, top, up_axis
@@ -213,14 +214,17 @@ def _driven(turns: np.ndarray, body: BodyRecord, pairs: dict[int, int], upright,
 
 
 def up_rotation(up: str, world: str) -> np.ndarray:
-    """Return the quarter turn about x from one axis that points up to another: Z up to Y up takes (x, y, z) to (x, z, -y)."""
-    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    return np.eye(3) if up == world else turn if world == "y" else turn.T
+    """Return the quarter turn from one axis that points up to another: Z up to Y up takes (x, y, z) to (x, z, -y).
+
+    X up to Y up takes (x, y, z) to (-y, x, z).
+    """
+    return (TURNS[world] @ TURNS[up].T).astype(np.float64)
 
 
 def turn_note(turn: np.ndarray) -> tuple[str, ...]:
     """Describe a turn of `up_rotation` in a note; none where nothing turns."""
-    return () if turn[1, 1] else ("turned from Z up to Y up" if turn[1, 2] > 0 else "turned from Y up to Z up",)
+    ways = [(up, world) for up in "xyz" for world in "yz" if up != world and np.array_equal(turn, up_rotation(up, world))]
+    return tuple(f"turned from {up.upper()} up to {world.upper()} up" for up, world in ways)
 
 
 def _overridden(pairs: dict[int, int], source: tuple[str, ...], target: tuple[str, ...], joints: Mapping[str, str]) -> dict:

@@ -113,7 +113,7 @@ def adapt(
     since, run = time.monotonic(), run if isinstance(run, Run) else load_run(run)
     run.check_terms()
     if not (math.isfinite(seconds) and seconds > 0):
-        raise InputError("a number of seconds above 0 expected", field="seconds", value=seconds)
+        raise InputError("a number of seconds above 0 expected", field="--adapt", value=seconds)
     out, say = None if out is None else Path(out), say or (lambda words: None)
     scene, records = _scene_on(run, motions)
     about = {"motions": list(records), "of": _digest(run, list(records.values()))}

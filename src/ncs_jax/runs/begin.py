@@ -15,7 +15,8 @@ import numpy as np
 
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
-from ncs_jax.prepare.build import SWING, Assembly, vibrations_of
+from ncs_jax.network.methods.choose import network_from
+from ncs_jax.prepare.build import SWING, Assembly, check_static, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
@@ -147,14 +148,21 @@ def _assemble_started(
         _check_network(name, before.scene.network, scene)
     if not scene.body.joints:
         scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
-    assembly = make_ready(scene)
+    same = (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment)
+    swings = same and network is None and before.model.vibrations is not None
+    # Its vibrations are known: made ready as one that does not swing, no minute is spent on looking for them.
+    assembly = make_ready(replace(scene, network=replace(scene.network, cell="gated")) if swings else scene)
     if not np.array_equal(before.garment.faces, assembly.garment.faces):
         size = f"{len(assembly.garment.vertices)} vertices, {len(assembly.garment.faces)} triangles"
         expected = f"the triangles of the garment of {name} expected, {len(before.garment.faces)}"
         raise InputError(expected, file=scene.source, field="garment.file", value=size, mend="train this garment anew")
+    if swings:
+        check_static(assembly.model, assembly.model.terms.own, assembly.track)
+        assembly = replace(_swinging(before.prepared, assembly), scene=scene)
+        assembly = replace(assembly, network=network_from(scene, assembly.model))
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0)).params
     _check_shapes(name, run.params, like, scene)
-    if (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment):
+    if same:
         assembly = _with_fields_of(before.prepared, assembly)
     if unread := unread_joints(assembly):
         told = f"the network of {name} does not read joints that turn in the motions: {', '.join(unread)}"
@@ -184,9 +192,14 @@ def _with_fields_of(before: Prepared, assembly: Assembly) -> Assembly:
     """Return an assembly with the smooth modes and the vibrations that the weights of another one were trained with."""
     model, prepared = assembly.model, replace(assembly.prepared, basis=before.basis)
     model = replace(model, basis=jnp.asarray(before.basis, model.basis.dtype))
-    if model.vibrations is not None:
-        prepared = replace(prepared, **{name: getattr(before, name) for name in SWING})
-        model = replace(model, vibrations=vibrations_of(prepared, model.basis.dtype))
+    assembly = replace(assembly, model=model, prepared=prepared)
+    return assembly if model.vibrations is None else _swinging(before, assembly)
+
+
+def _swinging(before: Prepared, assembly: Assembly) -> Assembly:
+    """Return an assembly with the vibrations of another one."""
+    prepared = replace(assembly.prepared, **{name: getattr(before, name) for name in SWING})
+    model = replace(assembly.model, vibrations=vibrations_of(prepared, assembly.model.basis.dtype))
     return replace(assembly, model=model, prepared=prepared)
 
 
@@ -198,7 +211,8 @@ def _check_shapes(name: str, params: dict, like: dict, scene: Scene) -> None:
         if before != expected:
             raise InputError(
                 f"weights of the shapes of {name} expected: {at} has {before or 'none'} there", file=scene.source,
-                field="network", value=expected or "none", mend="give the same garment, body, joints and network",
+                field="network", value=expected or "none",
+                mend="give the same garment, body, joints and network; one of your own is given in Python, network=...",
             )  # fmt: skip
 
 

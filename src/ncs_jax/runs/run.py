@@ -242,7 +242,8 @@ def check_own(facts: dict, folder: Path, terms: Sequence[OwnTerm] | None, networ
     for key, asked in (("terms", terms is not None), ("network", True)):
         expected = facts.get(key)
         if asked and given.get(key) != expected:
-            mend = f"give the {key} that it was trained with" if expected else f"leave {key} out, or begin a new run"
+            mend = f"in Python, give {key}=...: the commands have none of one's own"
+            mend = mend if expected else f"leave {key} out, or begin a new run"
             what = f"the run's own {key} expected, {expected or 'of which it has none'}"
             raise InputError(what, file=folder, field=key, value=given.get(key, "none"), mend=mend)
 

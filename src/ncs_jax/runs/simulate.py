@@ -47,7 +47,7 @@ class Progress:
     iterations: int
     residual: float  # g
     status: int
-    left: float  # s
+    left: float  # s; 0 where nobody knows yet
     compiling: bool = False
 
 
@@ -210,8 +210,10 @@ def _simulated(
         rows["status"].append(max(int(s.status) for s in solutions))
         now = time.monotonic()
         rows["seconds"].append(now - started)
+        begun = now if t == first else begun
         if report is not None:
-            left = (now - begun) / (t + 1 - first) * (frames - 1 - t)
+            # The first frame compiles, and the garment comes to rest in it: it tells nothing of the others.
+            left = (now - begun) / (t - first) * (frames - 1 - t) if t > first else 0.0
             report(Progress(t + 1, frames, rows["iterations"][-1], rows["residual"][-1], rows["status"][-1], left))
         if partial is not None and now - saved > pause and t + 1 < frames:
             arrays = {key: np.asarray(values) for key, values in rows.items()}

@@ -79,8 +79,11 @@ def train(
     facts = facts_of_run(out, resume, terms, network)
     if out is not None and facts is not None:
         scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
-        if minutes is None and Checkpoints(out).latest() == (steps or facts["steps"]):  # nothing is left to train
+        done = Checkpoints(out).latest()
+        if minutes is None and done == (steps or facts["steps"]):  # nothing is left to train
             return load_run(out, terms=terms, network=network)
+        if say is not None:
+            say(f"going on from step {done or 0}")
     programs, first = Programs(), CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps)
     begin = functools.partial(begin_programs, programs, count=first)  # while the rest is found out
     make_ready = functools.partial(assemble, terms=terms, network=network, report=say, ahead=begin)
@@ -146,7 +149,7 @@ def _check_options(steps: int | None, minutes: float | None, resume: bool, start
     if steps is not None and minutes is not None:
         raise InputError("either steps or minutes expected", field="minutes", value=minutes, mend="leave one of them out")
     if resume and start is not None:
-        raise InputError("a run that is resumed has weights", field="start", value=str(start), mend="leave it out")
+        raise InputError("a run that is resumed has weights", field="--from", value=str(start), mend="leave it out")
 
 
 def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int | None, minutes: float | None) -> int:

@@ -113,7 +113,7 @@ class MotionSpec:
         (), "first frame to use of every file, and the frame to stop before; empty: all frames", low=0, high=10**9, each=True
     )
     scale: float = _f(0.0, "metres a unit of the files; 0: 1, or by the legs for another skeleton", low=0, high=1e6, each=True)
-    up: str = _f("auto", "axis that points up in the files; auto: as the format says", choices=("auto", "y", "z"), each=True)
+    up: str = _f("auto", "axis that points up in the files; auto: as found", choices=("auto", "x", "y", "z"), each=True)
     rest: str = _f(
         "auto", "pose in which a skeleton of the files is a person: auto; zero; or the number of a frame in T-pose", each=True
     )

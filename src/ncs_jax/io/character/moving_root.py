@@ -14,10 +14,13 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.character.bvh import Bvh
 from ncs_jax.io.character.hierarchy import nearest_parents, path_to_root
 
-__all__ = ["SLIDE", "SPARE", "bvh_from_moving_root", "check_slides", "moving_root"]
+__all__ = ["LIMB", "SLIDE", "SPARE", "bvh_from_moving_root", "check_slides", "moving_root"]
 
 SLIDE = 0.05  # of a bone by which its end may leave its mean place; exporters that fit a motion to other bones leave some
-LIMB = re.compile(r"(hand|wrist|palm|head|neck|foot|ankle|toe|toes|ball|toebase)[^a-z]*(l|r|left|right)?\d*$")
+LIMB = re.compile(  # the end of a limb, in small letters; a ball is one of a foot only where it has a side
+    r"((hand|wrist|palm|head|neck|foot|ankle|toe|toes|toebase)[^a-z]*(l|r|left|right)?"
+    r"|(left|right|(?<![a-z])[lr][^a-z]*)ball|ball[^a-z]*(l|r|left|right))\d*$"
+)
 SPARE = 3  # joints that turn and may be left out, above the joint that carries the path or beside it; two legs are more
 
 

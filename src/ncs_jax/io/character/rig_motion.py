@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.hierarchy import nearest_parents
-from ncs_jax.io.character.moving_root import SLIDE, SPARE, check_slides, moving_root
+from ncs_jax.io.character.moving_root import LIMB, SLIDE, SPARE, check_slides, moving_root
 from ncs_jax.io.character.rig import Rig, rest_rotations
 from ncs_jax.io.records import MotionRecord
 from ncs_jax.io.tables.files import LARGEST
@@ -86,7 +86,8 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
 
     Raises:
         InputError: the motion lasts an hour or more, a joint scales by more than 1 %, or a joint leaves its mean place on its
-            parent by more than 1 cm and a twentieth of the bone. Joints that move no vertex may do both.
+            parent by more than 1 cm and a twentieth of the bone. Joints that move no vertex may do both. So may props: they
+            keep their place and size, see `carries_limb`.
     """
     begin, end, fps = times
     count = int(np.floor((end - begin) * fps + 1e-3)) + 1 if end - begin < HOUR else 0
@@ -96,12 +97,18 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
             mend="cut it into several",
         )  # fmt: skip
     back, turned, placed = np.linalg.pinv(rig.binds), [], []
+    props = rig.used & ~carries_limb(rig.names, rig.parents)
+    resized = np.zeros_like(props)
     for first in range(0, count, BLOCK):
         at = worlds(begin + np.arange(first, min(first + BLOCK, count)) / fps)
-        turned.append(_rotations(rig, (at @ back)[..., :3, :3], first))
+        turns, scaled = _rotations(rig, props, (at @ back)[..., :3, :3], first)
+        turned.append(turns)
         placed.append(at[..., :3, 3])
+        resized |= scaled
     world, place = np.concatenate(turned), np.concatenate(placed)
-    joints, kept, notes = _settled(rig, world, place)
+    joints, kept, notes = _settled(rig, props, world, place)
+    if held := [rig.names[j] for j in kept if resized[j]]:
+        notes = (*notes, f"props that change their size keep that at rest, as joints only turn: {', '.join(held[:8])}")
     rest, parents = rest_rotations(rig)[kept], nearest_parents(rig.parents, kept)
     local = world[:, kept]
     local[:, 1:] = np.swapaxes(local[:, parents[1:]], -1, -2) @ local[:, 1:]
@@ -111,10 +118,12 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
     return MotionRecord(poses, place[:, kept[0]] - joints[0], fps, names, joints, parents, rest_rotations=rest, notes=notes)
 
 
-def _settled(rig: Rig, world: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, list[int], tuple[str, ...]]:
+def _settled(
+    rig: Rig, props: np.ndarray, world: np.ndarray, place: np.ndarray
+) -> tuple[np.ndarray, list[int], tuple[str, ...]]:
     """Return rest joints whose bones are as long as they are on average, the numbers of the joints that are kept, and notes.
 
-    A bone keeps its place in the bind pose where it is within `GIVE` of it.
+    A bone keeps its place in the bind pose where it is within `GIVE` of it, and where it is a prop that slides.
     """
     joints, parents = rig.binds[:, :3, 3].copy(), rig.parents
     seen = np.einsum("tjba,tjb->tja", world[:, parents[1:]], place[:, 1:] - place[:, parents[1:]])
@@ -126,41 +135,63 @@ def _settled(rig: Rig, world: np.ndarray, place: np.ndarray) -> tuple[np.ndarray
     off = np.concatenate([[0.0], np.linalg.norm(seen - bones, axis=-1).max(axis=0)])
     length = np.concatenate([[0.0], np.linalg.norm(bones, axis=-1)])
     wrong = rig.used & (off > np.maximum(GIVE, SLIDE * length))
+    held, wrong = wrong & props, wrong & ~props
     own = np.asarray(rig.weights.any(axis=0))
     if not len(rig.weights):
         own = (np.abs(world - world[:1]) > 0.01).any(axis=(0, 2, 3)) & ~wrong
-    kept = moving_root(parents, wrong, own, 0 if len(rig.weights) else SPARE)
+    kept = moving_root(parents, wrong, own & ~props, 0 if len(rig.weights) else SPARE)
     others = kept[1:]
-    slides = np.where(rig.used & (off > GIVE), off, 0)
+    slides = np.where(rig.used & (off > GIVE) & ~held, off, 0)
     notes = check_slides(rig.file, [rig.names[j] for j in others], slides[others], length[others], wrong[others])
     near = np.linalg.norm(bones - bind, axis=-1) <= GIVE
-    changed = [j for j in others if rig.used[j] and not near[j - 1]]
+    changed = [j for j in others if rig.used[j] and not near[j - 1] and not held[j]]
     for j in others:
         joints[j] = joints[parents[j]] + (bones[j - 1] if j in changed else bind[j - 1])
     if changed:
         notes = (*notes, f"{len(changed)} bones are longer or shorter than in the bind pose, as {rig.names[changed[0]]}")
+    if still := [j for j in others if held[j]]:
+        named = ", ".join(rig.names[j] for j in still[:8])
+        what = f"props that slide keep their place at rest, as joints only turn: {named}, by up to {off[still].max():.2f} m"
+        notes = (*notes, what)
     if kept[0]:
         gone = ", ".join(n for j, n in enumerate(rig.names) if j not in kept)
         notes = (f"{rig.names[kept[0]]} carries the path, so it is the root; left out: {gone[:200]}", *notes)
     return joints[kept], kept, notes
 
 
-def _rotations(rig: Rig, linear: np.ndarray, first: int) -> np.ndarray:
-    """Return the rotations in matrices (T, J, 3, 3).
+def carries_limb(names: Sequence[str], parents: np.ndarray) -> np.ndarray:
+    """Tell of each joint (J,) whether the end of a limb, as a hand or the head, is at it or below; the others are props.
 
-    The matrix of a used joint must be one but for rounding. For other joints what is none becomes the identity.
+    Where no name tells a limb, all joints may be limbs.
+    """
+    ends = [bool(LIMB.search(n.lower())) for n in names]
+    out = np.array(ends)
+    for j in range(len(names) - 1, 0, -1):  # children come after their parents
+        out[parents[j]] |= out[j]
+    return out if any(ends) else np.ones(len(names), bool)
+
+
+def _rotations(rig: Rig, props: np.ndarray, linear: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotations in matrices (T, J, 3, 3), and which props (J,) change their size.
+
+    The matrix of a used joint must be one but for rounding. For other joints what is none becomes the identity, and for a prop,
+    which may have any size or none, the turn of its parent.
     """
     with np.errstate(all="ignore"):
         scale = np.cbrt(np.linalg.det(linear))
         turns = linear / scale[..., None, None]
         square = np.swapaxes(turns, -1, -2) @ turns
-        bad = ~((np.abs(scale - 1) < GIVE) & (np.abs(square - np.eye(3)).max(axis=(-1, -2)) < 2 * GIVE))
+        sheared = ~(np.abs(square - np.eye(3)).max(axis=(-1, -2)) < 2 * GIVE)
+        bad = sheared | ~(np.abs(scale - 1) < GIVE)
         for _ in range(3):  # to the nearest rotation (Higham 1986, Newton-Schulz)
             turns = turns @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(turns, -1, -2) @ turns)
-    if (bad & rig.used).any():
-        t, j = (int(i) for i in np.argwhere(bad & rig.used)[0])
+    if (wrong := bad & rig.used & ~props).any():
+        t, j = (int(i) for i in np.argwhere(wrong)[0])
         raise InputError(
             "rotations without scale expected", file=rig.file, field=f"animation, frame {t + first}, joint {rig.names[j]}",
             value=f"scaled by {float(scale[t, j]):.4g}, or sheared", mend="apply scale, and animate rotations only",
         )  # fmt: skip
-    return np.where(bad[..., None, None], np.eye(3), turns)
+    turns = np.where((bad & ~props)[..., None, None], np.eye(3), turns)
+    for j in np.flatnonzero(props & sheared.any(axis=0)).tolist():  # children come after their parents
+        turns[:, j] = np.where(sheared[:, j, None, None], turns[:, rig.parents[j]], turns[:, j])
+    return turns, bad.any(axis=0) & props

@@ -98,6 +98,11 @@ class Method(Protocol):
 
     What sets methods apart is how they begin, what a frame does to what they carry, and which energy trains them: `init`,
     `step` and `loss`. Energies, kinematics, decoder, training loop and evaluation are the same for all.
+
+    `track.static` and `track.dynamic` are the descriptors of all frames of the motions, laid end to end: (frames, joints,
+    numbers), of the sizes that `descriptor_sizes` gives. `track.start` (frames,) is the first frame of each one's motion. A
+    class of one's own inherits from `FromCodes` what it does not change; `notebooks/own_network.ipynb` has one of 30 lines, and
+    `network.methods.pbns` another.
     """
 
     @property
@@ -137,7 +142,12 @@ class Method(Protocol):
     def step(
         self, params: dict, model: Model, state: Array, static: Array, dynamic: Array | None, matrices: Array
     ) -> tuple[Array, Codes]:
-        """Return the state after a frame and its codes, from descriptors and joint transforms; of any number of characters."""
+        """Return the state after a frame and its codes, from descriptors and joint transforms; of any number of characters.
+
+        Args:
+            state: (*characters, state). static, dynamic: (*characters, joints, numbers); dynamic is None where `state` is 0.
+            matrices: (*characters, all joints, 3, 4).
+        """
 
     def loss(self, terms: Terms) -> Terms:
         """Return those of a scene's terms that train it, and whether inertia's target carries a gradient."""
@@ -155,7 +165,10 @@ class Method(Protocol):
         """Return the codes of every frame (frames, code) of one motion, from rest at its start."""
 
     def windows(self, params: dict, track: MotionFeatures, ends: Int[Array, "batch"], length: int, last: int) -> Codes:
-        """Return the codes (last, batch, code) of the `last` frames of windows of `length` frames that end at `ends`."""
+        """Return the codes (last, batch, code) of the `last` frames of windows of `length` frames that end at `ends`.
+
+        A window that would begin before its motion, at `track.start[ends]`, stands in that frame until then.
+        """
 
 
 def descriptor_sizes(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
