@@ -84,7 +84,9 @@ def write_living_page(
     scene: dict[str, object] = {"fps": float(model.fps), "frames": len(record.poses), "labels": []}
     scene["garment"] = {"verts": len(garment.vertices)}
     parts = {"script": runtime.script, "module": runtime.module, "wasm": runtime.wasm}
-    data = {"garment-faces": stored_faces(garment.faces)} | {f"runtime-{name}": deflated(part) for name, part in parts.items()}
+    data = {"garment-faces": stored_faces(garment.faces)} | {
+        f"runtime-{name}": deflated(part, 9) for name, part in parts.items()
+    }
     smaller = run.compressed(record, rank=rank) if rank else run
     steps, check = _steps(smaller, float16, record, (run.assembly.network, run.params), data)
     for step, place in zip(steps, _body(run, scene, data), strict=True):
@@ -127,7 +129,7 @@ def _steps(
         graphs.append((layer.model, *_graph(layer.model, *for_inference(layer.network, layer.params, layer.model))))
     facts = []
     for number, (own, step, graph) in enumerate(graphs):
-        data[f"step-{number}"] = deflated(_by_place(np.frombuffer(graph + bytes(-len(graph) % 4), "<i4")))
+        data[f"step-{number}"] = deflated(_by_place(np.frombuffer(graph + bytes(-len(graph) % 4), "<i4")), 9)
         joints = own.source_joints if run.assembly.body is not None else range(len(own.source_joints))
         size = {"bytes": len(graph), "state": step.arguments["state"][0]}
         facts.append({"id": f"step-{number}", "joints": list(joints), **size})

@@ -189,6 +189,6 @@ def stored_track(vertices):
     return {"low": low.tolist(), "step": step}, deflated(payload)
 
 
-def deflated(payload: bytes) -> str:
-    """Return bytes as base64 of what they deflate to."""
-    return base64.b64encode(zlib.compress(payload, 6)).decode("ascii")
+def deflated(payload: bytes, level: int = 6) -> str:
+    """Return bytes as base64 of what they deflate to; at level 9 they get smallest, which takes longest."""
+    return base64.b64encode(zlib.compress(payload, level)).decode("ascii")

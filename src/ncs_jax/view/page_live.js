@@ -356,15 +356,12 @@ function surveyed() {
 }
 
 // -- Start, and controls ----------------------------------------------------------------------------------------------------
-async function module(id) {
-  const address = URL.createObjectURL(new Blob([await unpack(id)], { type: "text/javascript" }));
-  return { address, made: () => import(address) };
-}
+const addressOf = async (id, type) => URL.createObjectURL(new Blob([await unpack(id)], { type }));
 
 async function load() {
-  ort = await (await module("runtime-script")).made();
-  ort.env.wasm.wasmPaths = { mjs: (await module("runtime-module")).address };
-  ort.env.wasm.wasmBinary = (await unpack("runtime-wasm")).buffer;
+  ort = await import(await addressOf("runtime-script", "text/javascript"));
+  const [mjs, wasm] = [await addressOf("runtime-module", "text/javascript"), await addressOf("runtime-wasm", "application/wasm")];
+  ort.env.wasm.wasmPaths = { mjs, wasm };
   ort.env.wasm.numThreads = 1, ort.env.wasm.proxy = false, ort.env.logLevel = "error";
   sessions = [];
   for (const step of steps) sessions.push(await ort.InferenceSession.create(unshuffled(await unpack(step.id), step.bytes), { executionProviders: ["wasm"] }));
