@@ -37,7 +37,8 @@ class Browser:
             ["bash", "-c", as_it_reads, "browser", *command, "--remote-debugging-pipe", "about:blank"],
             pass_fds=(down, up), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        os.close(down), os.close(up)
+        for end in (down, up):
+            os.close(end)
         page = next(each for each in self.call("Target.getTargets")["targetInfos"] if each["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         for domain in ("Runtime", "Page", "Log"):
@@ -53,7 +54,8 @@ class Browser:
         except (EOFError, OSError):
             self._process.kill()
         self._process.wait(30)
-        os.close(self._out), os.close(self._in)
+        for end in (self._out, self._in):
+            os.close(end)
 
     def call(self, method: str, **parameters) -> dict:
         self._count += 1

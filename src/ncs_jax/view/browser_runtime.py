@@ -98,11 +98,11 @@ def _member(archive: tarfile.TarFile, name: str) -> bytes:
 def _read(read: Callable[[str], bytes], place: Path) -> BrowserRuntime:
     try:
         facts = json.loads(read("package.json"))
-        parts = [read(name) for name in (SCRIPT, MODULE, WASM)]
+        script, module, wasm = (read(name) for name in (SCRIPT, MODULE, WASM))
     except (OSError, ValueError) as fault:
         what = f"the npm package {PACKAGE} expected, 1.19 or later, with package.json, {SCRIPT}, {MODULE} and {WASM}"
         raise InputError(what, file=place, field="--runtime", value=str(fault), mend=MEND) from fault
     if facts.get("name") != PACKAGE:
         raise InputError(f"the npm package {PACKAGE} expected", file=place, field="name", value=facts.get("name"), mend=MEND)
     version = str(facts.get("version", ""))
-    return BrowserRuntime(version, *parts, notice=NOTICE.format(package=PACKAGE, version=version))
+    return BrowserRuntime(version, script, module, wasm, notice=NOTICE.format(package=PACKAGE, version=version))

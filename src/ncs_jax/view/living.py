@@ -196,16 +196,14 @@ def _body(run: Run, scene: dict, data: dict) -> list[int]:
 def _skeleton(run: Run) -> dict:
     """Return the joints: of the body, else those that the garment reads."""
     body, model = run.assembly.body, run.assembly.model
-    if body is None:
-        parents, joints, axes = model.skeleton.parents, model.skeleton.joints, model.rest_rotations
-        names = tuple(str(number) for number in model.source_joints)
-    else:
-        parents, joints, axes, names = body.parents, body.joints, body.rest_rotations, body.joint_names
+    known = model.skeleton if body is None else body
+    axes = model.rest_rotations if body is None else body.rest_rotations
+    names = tuple(map(str, model.source_joints)) if body is None else body.joint_names
     return {
-        "parents": [int(parent) for parent in parents],
-        "joints": np.asarray(joints, float).tolist(),
+        "parents": [int(parent) for parent in known.parents],
+        "joints": np.asarray(known.joints, float).tolist(),
         "axes": None if axes is None else np.asarray(axes, float).reshape(-1, 9).tolist(),
-        "names": list(names or map(str, range(len(parents)))),
+        "names": list(names or map(str, range(len(known.parents)))),
     }
 
 

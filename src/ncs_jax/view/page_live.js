@@ -111,9 +111,8 @@ async function run(input, drawnToo = true) {
 }
 
 const fresh = () => steps.map(step => new Float32Array(step.state));
-const posedAt = frame => ({
-  pose: kinematics(frame, edits.reached, edits.moveReached),
-  move: [0, 1, 2].map(c => now.translation[3 * frame + c] + edits.moveReached[c]),
+const posedAt = (frame, turns = edits.reached, moved = edits.moveReached) => ({
+  pose: kinematics(frame, turns, moved), move: [0, 1, 2].map(c => now.translation[3 * frame + c] + moved[c]),
 });
 
 /** Take one step in time, in the pose of a frame; of `drawnToo` false only the states are of use. */
@@ -328,29 +327,32 @@ async function chooseMotion(number) {
   now.refined = motion.refined?.track;
   const size = steps.reduce((sum, step) => sum + step.state, 0);
   Object.assign(sim, { at: -1, kept: [], every: Math.ceil(frames * size / STATES), inputs: [], shown: [], stale: false, debt: 0 });
-  motion.place ||= surveyed();
+  motion.place ||= await surveyed();
   place = motion.place;
   state.motion = number, state.frame = Math.min(state.frame, last);
   $("scrub").max = last;
 }
 
-/** Where the character goes in the motion, as `survey` reads it: from its skin, or from the joints where it has none. */
-function surveyed() {
+/** Where the character goes in the motion, as `survey` reads it: its skin, a third of which will do, or the cloth alone. */
+async function surveyed() {
   const box = new Float32Array(6 * frames).fill(-Infinity), middle = new Float32Array(3 * frames);
-  const skin = bodyRest && new Float32Array(bodyRest.length), none = new Map();
-  for (let f = 0; f < frames; f++) {
-    const pose = kinematics(f, none, [0, 0, 0]);
-    if (skin) skinBody(pose, skin);
-    const points = skin || Float32Array.from(pose.places.flat()), sum = [0, 0, 0], apart = skin ? 3 : 0.2;
-    for (let i = 0; i < points.length; i += 3 * (skin ? 3 : 1)) {  // a third of the skin will do
+  const skin = bodyRest && new Float32Array(bodyRest.length), stride = skin ? 9 : 3;
+  for (let f = 0, states = fresh(); f < frames; f++) {
+    const input = { states, ...posedAt(f, new Map(), [0, 0, 0]) }, sum = [0, 0, 0];
+    let points = skin;
+    if (skin) skinBody(input.pose, skin);
+    else {
+      const { next, out } = await run(input);
+      states = next, points = out.cloth[0];
+    }
+    for (let i = 0; i < points.length; i += stride) {
       const p = upright([points[i], points[i + 1], points[i + 2]]);
       for (let c = 0; c < 3; c++) {
         sum[c] += p[c];
-        box[6 * f + c] = Math.max(box[6 * f + c], -p[c] + (skin ? 0 : apart)), box[6 * f + 3 + c] = Math.max(box[6 * f + 3 + c], p[c] + (skin ? 0 : apart));
+        box[6 * f + c] = Math.max(box[6 * f + c], -p[c]), box[6 * f + 3 + c] = Math.max(box[6 * f + 3 + c], p[c]);
       }
     }
-    const count = Math.ceil(points.length / 3 / (skin ? 3 : 1));
-    for (let c = 0; c < 3; c++) middle[3 * f + c] = sum[c] / count;
+    for (let c = 0; c < 3; c++) middle[3 * f + c] = sum[c] / Math.ceil(points.length / stride);
   }
   return survey({ box, middle }, { box, middle });
 }
@@ -442,7 +444,7 @@ globalThis.ncs = {
     const kept = [state.alpha, state.compare];
     [state.alpha, state.compare] = [alpha, false];
     for (let f = 0, states = fresh(); f < frames; f++) {
-      const { next, out } = await run({ states, ...posedAt(f) });
+      const { next, out } = await run({ states, ...posedAt(f, new Map(), [0, 0, 0]) });
       states = next, all.push([out.cloth[0], out.body].map(x => x && x.map((v, i) => v + motions[state.motion].start[i % 3])));
     }
     [state.alpha, state.compare] = kept;
