@@ -33,6 +33,8 @@ from ncs_jax.view.preview import preview as draw_preview
 
 from .characters import skinned
 from .scenes import grid, post, swing, write_scene
+from .test_living_page import package
+from .test_viewer import Page
 
 
 @pytest.fixture(autouse=True)
@@ -677,6 +679,28 @@ def test_export_says_what_it_wrote_and_how_far_it_is(run_folder, tmp_path, capsy
     assert main(["export", str(folder), "--out", str(tmp_path / "a.stablehlo")]) == 2
     one_line(capsys, ["a.stablehlo", "--format stablehlo"])
     assert not list(tmp_path.glob("a.*"))
+
+
+def test_export_writes_a_page_that_runs_the_garment(run_folder, tmp_path, capsys, monkeypatch):
+    _, folder = run_folder
+    out = tmp_path / "page.html"
+    monkeypatch.chdir(tmp_path)
+    web = ["export", str(folder), "--format", "web"]
+    assert main([*web, "--out", str(out)]) == 2
+    one_line(capsys, ["--runtime", "npm pack onnxruntime-web"])
+    package(tmp_path / "node_modules" / "onnxruntime-web")
+    assert main([*web, "--out", str(tmp_path / "page.onnx")]) == 2
+    one_line(capsys, ["page.onnx", ".html"])
+    assert main([*web, "--out", str(out), "--opset", "17"]) == 2
+    one_line(capsys, ["--opset", "17", "leave it out"])
+    assert main(["export", str(folder), "--out", str(tmp_path / "a.onnx"), "--refine", "2"]) == 2
+    one_line(capsys, ["--refine", "--format web"])
+    assert not list(tmp_path.glob("*.*"))
+    assert main([*web, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert f"{out}: " in text and "1 motion; open it in a browser" in text and "24 frames of its network" in text
+    (name,) = [motion["name"] for motion in Page(out).scene["live"]["motions"]]
+    assert name.endswith("swing.npz")
 
 
 def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, monkeypatch):

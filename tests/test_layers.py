@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 
 from ncs_jax import InputError, Run, assemble, load_run, load_scene, measure, simulate, train
@@ -14,10 +15,14 @@ from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.surface import vertex_normals
 from ncs_jax.scene.model import pose_body
+from ncs_jax.training.step import initial_state
+from ncs_jax.view.browser_runtime import BrowserRuntime
 from ncs_jax.view.character import posed_body
+from ncs_jax.view.living import write_living_page
 
 from .scenes import SCENE, write_scene
 from .shapes import tube
+from .test_viewer import Page
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,6 +73,25 @@ def test_what_is_drawn_below_is_the_body_and_then_the_garments(folder, worn):
     np.testing.assert_allclose(vertices[:, -count:], x, atol=1e-6)
     np.testing.assert_array_equal(faces[: len(worn.body.faces)], worn.body.faces)
     np.testing.assert_array_equal(faces[len(worn.body.faces) :], np.asarray(below.faces) + len(worn.body.vertices))
+
+
+def test_a_living_page_runs_both_garments(folder, worn, tmp_path):
+    """The one below is drawn as the last vertices of the body."""
+    below, (motion,) = load_run(folder / "run"), worn.motions.values()
+    run = Run(worn, initial_state(worn.model, worn.network, 0).params)
+    write_living_page(tmp_path / "a.html", run, {"swing": motion}, BrowserRuntime("1", b"", b"", b"", ""))
+    page = Page(tmp_path / "a.html")
+    steps, body = page.scene["live"]["steps"], page.scene["body"]
+    assert [step["first"] for step in steps] == [0, 3 * len(worn.body.vertices)]
+    assert body["worn"] == len(below.assembly.garment.vertices) == body["verts"] - len(worn.body.vertices)
+    np.testing.assert_array_equal(page.faces("body-faces"), posed_body(worn, motion).faces)
+    for step, each in zip(steps, (run, below), strict=True):
+        graph = np.frombuffer(page.bytes(step["id"]), np.uint8).reshape(4, -1).T.tobytes()[: step["bytes"]]
+        session, turns = onnxruntime.InferenceSession(graph), np.tile(np.eye(3, dtype=np.float32), (len(step["joints"]), 1, 1))
+        zeros = [np.zeros(n, np.float32) for n in (step["state"], 3)]
+        inputs = {"state": zeros[0], "rotations": turns, "translation": zeros[1], "alpha": np.ones(1, np.float32)}
+        at_rest = motion.__class__(0 * motion.poses[:1], 0 * motion.translation[:1], motion.fps, ())
+        np.testing.assert_allclose(session.run(None, inputs)[1], each.animate(at_rest)[0], rtol=0, atol=1e-4)
 
 
 def test_skin_that_is_covered_does_not_collide(worn):

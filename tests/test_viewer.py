@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
-import subprocess
 import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -14,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation, PosedBody
 from ncs_jax.view.page import write_page
+
+from .browser import CHROMIUM, Browser
 
 FRAMES = 24
 
@@ -239,19 +238,13 @@ def test_a_page_turns_what_has_another_up(tmp_path, scene):
     np.testing.assert_allclose(stored, scene["animations"]["0"], rtol=0, atol=3e-5)
 
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-
-
 def screenshot(tmp_path: Path, page: Path, view: str) -> np.ndarray:
-    picture = tmp_path / "view.png"
-    picture.unlink(missing_ok=True)
-    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
-    command += ["--enable-unsafe-swiftshader", "--hide-scrollbars", "--force-device-scale-factor=1", "--window-size=640,480"]
-    command += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0", "--virtual-time-budget=4000"]
-    done = subprocess.run([*command, f"--screenshot={picture}", f"{page.as_uri()}#{view}"], capture_output=True, timeout=120)
-    complaints = [line for line in done.stderr.decode(errors="replace").splitlines() if "CONSOLE" in line]
-    assert not complaints and picture.exists()
-    return np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    with Browser(f"{page.as_uri()}#{view}", tmp_path / "profile") as browser:
+        browser.call("Emulation.setDeviceMetricsOverride", width=640, height=480, deviceScaleFactor=1, mobile=False)
+        browser.until("document.documentElement?.dataset.ready === 'true'")
+        browser.evaluate("new Promise(done => setTimeout(done, 1000))")
+        assert not browser.complaints
+        return browser.screenshot()
 
 
 def cloth_coloured(image: np.ndarray) -> np.ndarray:
@@ -261,7 +254,7 @@ def cloth_coloured(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_browser_draws_it(tmp_path, scene):
     written(tmp_path, scene, facts={})
     page = tmp_path / "preview.html"
@@ -295,7 +288,7 @@ def test_a_browser_draws_it(tmp_path, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_browser_draws_a_garment_alone(tmp_path, scene):
     written(tmp_path, scene, animations={"0": scene["animations"]["0"]}, body=None, body_faces=None)
     assert cloth_coloured(screenshot(tmp_path, tmp_path / "preview.html", "paused&frame=23")).sum() > 1500

@@ -155,7 +155,8 @@ def _run_python(sample: Sample, names: dict) -> str:
 
 
 def _run_command(sample: Sample, experiments: bool) -> str | None:
-    if sample.text.startswith(("srun", "CUDA_VISIBLE_DEVICES")) or "--hosts" in sample.text:
+    elsewhere = "--hosts" in sample.text or "--format web" in sample.text  # other machines, or a package of npm
+    if sample.text.startswith(("srun", "CUDA_VISIBLE_DEVICES")) or elsewhere:
         return None
     words = [NAMES.get(word, word) for word in next(iter(written_out(sample.text)))]
     program, *rest = words

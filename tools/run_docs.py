@@ -33,7 +33,7 @@ FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?: {4}\S.*\n)+")
 SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 PROGRAMS = ("ncs", "make", "python", "pytest", "pip")
-OTHERS = ("python3", ".", "cd", "git", "g++", "./host")  # a shell's own, what sets up an environment, and what is compiled
+OTHERS = ("python3", ".", "cd", "git", "g++", "./host", "npm")  # a shell's own, what sets things up, and what is compiled
 LEADING = re.compile(r"^((?:[A-Z_]+=\S+|srun)\s+)*")
 BRACKET = re.compile(r"\s*\[(-[^\]]*)\]")
 PLACEHOLDERS = {"N": "1", "M": "1", "K": "1", "A": "1", "R": "8"}

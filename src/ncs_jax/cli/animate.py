@@ -1,4 +1,4 @@
-"""`ncs animate` and `ncs export`: a trained garment over a motion, and its step as a file."""
+"""`ncs animate` and `ncs export`: a trained garment over a motion, and its step as a file or in a page."""
 
 from __future__ import annotations
 
@@ -57,12 +57,30 @@ def add_commands(commands) -> None:
         commands, "export", export, "write one step of a trained garment for a host that has neither JAX nor this package"
     )
     parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
-    parser.add_argument("--format", choices=("onnx", "stablehlo"), default="onnx", help="default: onnx")
+    parser.add_argument(
+        "--format", choices=("onnx", "stablehlo", "web"), default="onnx",
+        help="web: one .html in which a browser runs it; motions, alpha, joints to drag (default: onnx)",
+    )  # fmt: skip
     parser.add_argument("--out", required=True, metavar="FILE", help="the file; what a host has to know goes to FILE.json")
-    parser.add_argument("--motion", metavar="FILE", help="to check it on and to fit --rank to (default: one of the scene's)")
+    parser.add_argument(
+        "--motion", metavar="FILE", action="append", default=[],
+        help="to check it on and to fit --rank to (default: one of the scene's); web: in the page, given again, one more "
+        "(default: all of the scene's)",
+    )  # fmt: skip
     parser.add_argument("--rank", type=arguments.whole, default=0, help="a smaller decoder: its rank, say 64; prints the error")
     parser.add_argument("--float16", action="store_true", help="store weights in 16 bits (computed in 32); prints the error")
     parser.add_argument("--opset", type=arguments.whole, default=15, help="of the ONNX operators, 13 to 21 (default: 15)")
+    parser.add_argument(
+        "--runtime",
+        metavar="PLACE",
+        help="web: the npm package onnxruntime-web, its .tgz or folder (npm pack onnxruntime-web; default: in this folder)",
+    )
+    parser.add_argument(
+        "--refine",
+        type=arguments.whole,
+        metavar="N",
+        help="web: the first motion after N iterations of the solver as well, to be compared with (default: none)",
+    )
 
 
 def animate(options) -> int:
@@ -87,7 +105,7 @@ def animate(options) -> int:
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     if options.refine:
-        vertices = _refined(run, motion, options)
+        vertices = _refined(run, motion, options.alpha, options.refine)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
     if suffix == ".mp4":
@@ -135,15 +153,15 @@ def _write_video(run: Run, motion: MotionRecord, vertices: np.ndarray, options) 
         animation_mp4(options.out, shown, report=lambda share: progress.show("drawing the video", share, 1.0))
 
 
-def _refined(run: Run, motion: MotionRecord, options) -> np.ndarray:
+def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int) -> np.ndarray:
     """Return the animation after some iterations of the solver on every frame, with a bar."""
     from ncs_jax.cli.progress import WorkProgress
 
     with WorkProgress("compiling the solver") as progress:
         return run.animate(
             motion,
-            options.alpha,
-            refine=options.refine,
+            alpha,
+            refine=iterations,
             report=lambda frame, frames: progress.show(f"refining frame {frame}/{frames}", frame, frames),
         )
 
@@ -193,7 +211,38 @@ def export(options) -> int:
     from ncs_jax.export.facts import FileFormat
     from ncs_jax.runs.run import load_run
 
+    if options.format == "web":
+        return _export_page(options)
     FileFormat(options.format).check_name(Path(options.out))  # before the run is read
-    chosen = {name: getattr(options, name) for name in ("format", "rank", "float16", "opset", "motion")}
-    print(load_run(options.folder).export(options.out, **chosen))
+    for field in ("runtime", "refine"):
+        if getattr(options, field) is not None:
+            raise InputError("--format web expected", field=f"--{field}", value=getattr(options, field), mend="leave it out")
+    if len(options.motion) > 1:
+        raise InputError("one motion expected", field="--motion", value=", ".join(options.motion), mend="or --format web")
+    chosen = {name: getattr(options, name) for name in ("format", "rank", "float16", "opset")}
+    print(load_run(options.folder).export(options.out, motion=next(iter(options.motion), None), **chosen))
+    return 0
+
+
+def _export_page(options) -> int:
+    """Write the page in which a browser runs a garment, and print how it was checked."""
+    from ncs_jax.cli.check import tell_beyond
+    from ncs_jax.runs.run import load_run
+    from ncs_jax.view.browser_runtime import read_runtime
+    from ncs_jax.view.living import check_name, write_living_page
+
+    check_name(Path(options.out))
+    if options.opset != 15:
+        raise InputError("15 expected for web", field="--opset", value=options.opset, mend="leave it out")
+    runtime = read_runtime(options.runtime)
+    run = load_run(options.folder)
+    spec = run.assembly.scene.motion
+    names = options.motion or [*spec.validation, *spec.files]
+    motions = {name: run.motion(name) for name in dict.fromkeys(names)}
+    for name in options.motion:
+        tell_beyond(run.coverage(motions[name]))
+    refined = None
+    if options.refine and motions:
+        refined = options.refine, _refined(run, next(iter(motions.values())), 1.0, options.refine)
+    print(write_living_page(options.out, run, motions, runtime, rank=options.rank, float16=options.float16, refined=refined))
     return 0

@@ -24,7 +24,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs train SCENE --out RUN         train the garment of a scene file (packaged: ncs:demo, ncs:tshirt, ncs:skirt, ncs:dress)
   ncs preview RUN                   draw it again: a picture, a page that plays it, a GIF
   ncs animate RUN --out FILE        animate a trained garment
-  ncs export RUN --out FILE         write its step for a game engine or another host, as ONNX or StableHLO
+  ncs export RUN --out FILE         write its step for engines and hosts, as ONNX or StableHLO, or a page that runs it
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs view RUN|FILE|SCENE           look at it in a browser: play, scrub, orbit, alpha, colours

@@ -15,9 +15,10 @@ from ncs_jax.export.stablehlo import expiry
 from ncs_jax.export.step import Step
 from ncs_jax.prepare.build import Assembly
 
-__all__ = ["FORMATS", "FileFormat", "host_facts"]
+__all__ = ["FORMATS", "PAGES", "FileFormat", "host_facts"]
 
 FORMATS = {"onnx": (".onnx",), "stablehlo": ("", ".stablehlo")}  # and how a file's name may end
+PAGES = {"web": (".html", ".htm")}  # what `ncs export` writes besides, see `view.living`
 INTERFACE = 1  # of the step and the facts: a change that breaks a host gives the next number
 
 
@@ -46,7 +47,7 @@ class FileFormat:
         """Raise an InputError where a file's name ends otherwise than this format's do."""
         endings, found = FORMATS[self.name], file.suffix.lower()
         if found not in endings:
-            other = next((name for name, theirs in FORMATS.items() if found in theirs), None)
+            other = next((name for name, theirs in (FORMATS | PAGES).items() if found in theirs), None)
             mend = f"add --format {other}" if other else f"end the name in {endings[-1]}"
             raise InputError(f"a name in {endings[-1]} expected for {self.name}", file=file, value=found, mend=mend)
 

@@ -16,7 +16,7 @@ import numpy as np
 from ncs_jax.errors import InputError
 from ncs_jax.view.animation import Animation
 
-__all__ = ["Encoded", "encode", "write_encoded", "write_page"]
+__all__ = ["Encoded", "deflated", "encode", "fill_page", "stored_faces", "stored_track", "write_encoded", "write_page"]
 
 STEP = 5e-5
 """The grid that positions are rounded to, in m; coarser where one frame spans more than 3.2 m."""
@@ -58,6 +58,22 @@ def encode(animations: Mapping[str, Animation]) -> Encoded:
 
 def write_encoded(path: str | Path, encoded: Encoded, *, title: str = "", facts: Mapping[str, str] | None = None) -> None:
     """Write what `write_page` does."""
+    fill_page(path, encoded, "recorded", title=title, facts=facts)
+
+
+def fill_page(
+    path: str | Path,
+    encoded: Encoded,
+    player: str,
+    *,
+    title: str = "",
+    facts: Mapping[str, str] | None = None,
+    notices: str = "",
+) -> None:
+    """Write a page with a player, whose script is `page_PLAYER.js` and whose controls are in `page_PLAYER.html`.
+
+    notices: HTML that is shown under the help.
+    """
     scene, data = encoded
     rows = (f"<div><dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd></div>" for k, v in (facts or {}).items())
     blocks = (f'<script type="application/octet-stream" id="{name}">{text}</script>' for name, text in data.items())
@@ -66,25 +82,38 @@ def write_encoded(path: str | Path, encoded: Encoded, *, title: str = "", facts:
         "FACTS": "\n        ".join(rows),
         "SCENE": json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),
         "DATA": "\n".join(blocks),
+        "NOTICES": notices,
+        "PLAYER": _beside(f"page_{player}.js"),
+        **_sections(_beside(f"page_{player}.html")),
     }
-    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], template)
+    page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts.get(match[1], ""), _beside("page.html"))
     Path(path).write_text(page, encoding="utf-8", newline="\n")
+
+
+def _beside(name: str) -> str:
+    """Return the text of a file beside this one."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+def _sections(text: str) -> dict[str, str]:
+    """Return parts of a page by their places in `page.html`, which stand in comments before them."""
+    parts = re.split(r"<!-- ([A-Z]+) -->\n", text)
+    return {name: part.rstrip("\n") for name, part in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def _scene(animations: dict[str, Animation]) -> Encoded:
     """Return what the page's script reads."""
     first = next(iter(animations.values()))
     frames, verts, _ = first.garment.shape
-    tracks = [_track(each.garment) for each in animations.values()]
+    tracks = [stored_track(each.garment) for each in animations.values()]
     data = {f"track-{i}": payload for i, (_, payload) in enumerate(tracks)}
     scene: dict[str, object] = {"fps": float(first.fps), "frames": frames, "labels": list(animations)}
     scene["garment"] = {"verts": verts, "tracks": [record for record, _ in tracks]}
-    data["garment-faces"] = _faces(first.garment_faces)
+    data["garment-faces"] = stored_faces(first.garment_faces)
     if first.body is not None:
-        record, data["track-body"] = _track(first.body.vertices)
+        record, data["track-body"] = stored_track(first.body.vertices)
         scene["body"] = {"verts": first.body.vertices.shape[1], "worn": first.body.worn, "tracks": [record]}
-        data["body-faces"] = _faces(first.body.faces)
+        data["body-faces"] = stored_faces(first.body.faces)
     return Encoded(scene, data)
 
 
@@ -137,12 +166,12 @@ def _check_finite(vertices: np.ndarray, name: str) -> None:
         )  # fmt: skip
 
 
-def _faces(faces: np.ndarray) -> str:
+def stored_faces(faces: np.ndarray) -> str:
     """Return triangles as base64 of deflated little-endian int32."""
-    return _text(faces.astype("<i4").tobytes())
+    return deflated(faces.astype("<i4").tobytes())
 
 
-def _track(vertices):
+def stored_track(vertices):
     """Return where the numbers lie, and the positions themselves.
 
     Each frame is its mean, a float32, and for each axis and vertex a uint16 on a grid around it. These are stored as second
@@ -157,8 +186,9 @@ def _track(vertices):
         grid = np.diff(grid, axis=0, prepend=np.zeros_like(grid[:1]))
     pairs = np.ascontiguousarray(grid % 65536).astype("<u2").view(np.uint8).reshape(-1, 2)
     payload = middle.tobytes() + pairs[:, 0].tobytes() + pairs[:, 1].tobytes()
-    return {"low": low.tolist(), "step": step}, _text(payload)
+    return {"low": low.tolist(), "step": step}, deflated(payload)
 
 
-def _text(payload):
-    return base64.b64encode(zlib.compress(payload, 6)).decode("ascii")
+def deflated(payload: bytes, level: int = 6) -> str:
+    """Return bytes as base64 of what they deflate to; at level 9 they get smallest, which takes longest."""
+    return base64.b64encode(zlib.compress(payload, level)).decode("ascii")
