@@ -32,7 +32,7 @@ from ncs_jax.view.character import body_vertices
 from ncs_jax.view.preview import preview as draw_preview
 
 from .characters import skinned
-from .scenes import grid, post, swing, write_scene
+from .scenes import SCENE, grid, post, swing, write_scene
 from .test_living_page import package
 from .test_viewer import Page
 
@@ -44,11 +44,11 @@ def _plain(plain_jax):
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
-    """A run that was trained for a moment; (scene file, run folder)."""
+    """A run that was trained for a moment, and shows skin between its vertices; (scene file, run folder)."""
     import jax
 
     folder = tmp_path_factory.mktemp("trained")
-    scene = write_scene(folder)
+    scene = write_scene(folder, SCENE + '[physics.collision]\npoints = "0"\n')
     with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         train(scene, folder / "run", steps=10)
     return scene, folder / "run"

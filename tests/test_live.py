@@ -11,8 +11,8 @@ from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.view.character import animation_of, body_vertices
 from ncs_jax.view.live import BINS, COLOURS, THROUGH, View, animated_garment, colour_bins, vertex_values, view
 
+from .browser import CHROMIUM
 from .scenes import write_scene
-from .test_viewer import BROWSER
 
 pytest.importorskip("viser")
 
@@ -92,7 +92,8 @@ def test_faces_have_the_colour_of_their_corners():
 def test_what_cannot_be_shown_is_named(scene, tmp_path):
     file = tmp_path / "moved.npz"
     io.write_animation(file, np.zeros((3, 30, 3), np.float32), np.array([[0, 1, 2]], np.int32), 30.0)
-    for given, told in (((str(file),), "--scene"), ((str(file), str(scene)), "24, 30, 3"), (("nowhere.toml",), "nowhere")):
+    without = (str(file),), "add scene SCENE"
+    for given, told in (without, ((str(file), str(scene)), "24, 30, 3"), (("nowhere.toml",), "nowhere")):
         with pytest.raises(InputError, match=told):
             animated_garment(*given)
 
@@ -128,7 +129,7 @@ def test_a_notebook_shows_the_page_which_plays_until_it_is_closed(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_browser_shows_a_run(scene, tmp_path):
     train(scene, tmp_path / "run", steps=10)
     window = view(str(tmp_path / "run"), port=0)
@@ -136,7 +137,7 @@ def test_a_browser_shows_a_run(scene, tmp_path):
     try:
         assert window.subject.controlled
         window.playing.value = False
-        command = [str(BROWSER), "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        command = [str(CHROMIUM), "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=900,700", "--virtual-time-budget=15000"]
         with subprocess.Popen([*command, f"--screenshot={picture}", window.address], stderr=subprocess.DEVNULL) as browser:
             for _ in range(120):

@@ -176,7 +176,7 @@ def test_what_cannot_be_a_page_is_named(tmp_path):
         with pytest.raises(InputError, match=word):
             write_living_page(tmp_path / file, run, given, RUNTIME)
         assert not (tmp_path / file).exists()
-    with pytest.raises(InputError, match="--format web"):
+    with pytest.raises(InputError, match="add format web"):
         FileFormat().check_name(tmp_path / "a.html")
 
 

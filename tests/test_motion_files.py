@@ -318,7 +318,7 @@ WRONG = {
     "three": ([{"file": "a.bvh", "frames": [1, 2, 3]}], {}, r"motion.files\[0\].frames: one or two numbers"),
     "below": (["ncs:walk", {"file": "a.bvh", "frames": [-1]}], {}, r"motion.files\[1\].frames\[0\]: a number from 0"),
     "scale": ([{"file": "a.bvh", "scale": "cm"}], {}, r"motion.files\[0\].scale: a number expected.*found 'cm'"),
-    "up": ([], {"validation": [{"file": "a.bvh", "up": "x"}]}, r"motion.validation\[0\].up: one of auto, y, z"),
+    "up": ([], {"validation": [{"file": "a.bvh", "up": "w"}]}, r"motion.validation\[0\].up: one of auto, x, y, z"),
     "key": ([{"file": "a.bvh", "fps": 30}], {}, r"motion.files\[0\].fps: unknown key.*file, frames, scale, up, rest, joints"),
     "no file": ([{"frames": [1]}], {}, r"motion.files\[0\].file: the motion's file expected"),
     "twice": ([{"file": "a.bvh[1:2]", "frames": [1]}], {}, r"motion.files\[0\].frames: frames given once"),
