@@ -27,11 +27,12 @@ from ncs_jax.geometry.skinning import (
 )
 from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io import read_body, read_garment
+from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.packaged import packaged
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.skinning_weights import hung_weights, smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import touchable, touchable_part
+from ncs_jax.prepare.touchable import bare_soles, touchable, touchable_part
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import GarmentSpec, Scene, load_scene
@@ -226,6 +227,21 @@ def test_touchable_is_what_a_search_of_every_pair_finds(rng, reach):
         assert (by_pose[1] & ~by_pose[0] & ~by_pose[2]).any()  # the folded arm is what the poses are looked at for
     at_rest = touchable(record, cloth, blend, np.zeros((0, 2, 3)), reach)
     np.testing.assert_array_equal(at_rest, by_pose[0])
+
+
+def test_soles_are_not_touched_but_by_what_is_under_them():
+    body, dress = read_body(packaged("body")), read_garment(packaged("dress"))
+    soles = bare_soles(body, dress.vertices)
+    normals = vertex_normals(body.vertices, body.faces)
+    feet = body.weights[soles] @ np.array(["Foot" in name or "Toe" in name for name in body.joint_names], float)
+    assert soles.sum() > 100 and (body.vertices[soles, 1] < 0.05).all() and (normals[soles, 1] < 0).all() and (feet > 0.9).all()
+    tops = (body.vertices[:, 1] < 0.08) & (normals[:, 1] > 0.5)
+    assert tops.any() and not (soles & tops).any()
+    sock = body.vertices[soles] + 0.003 * normals[soles]  # cloth under both feet
+    assert not bare_soles(body, sock).any()
+    left = body.vertices[:, 0] > 0
+    other = bare_soles(body, sock[left[soles]])
+    assert other.any() and not (other & left).any()
 
 
 def test_enclosure_is_the_winding_number_away_from_the_cloth(rng):

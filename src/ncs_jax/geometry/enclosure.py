@@ -18,14 +18,12 @@ def enclosure(x: np.ndarray, garment: np.ndarray, faces: np.ndarray) -> np.ndarr
     from the garment than its edges are long (`test_enclosure_is_the_winding_number_away_from_the_cloth`). Source: Barill et al.
     2018, the first term of their expansion.
     """
-    corners, area = np.asarray(garment, np.float32)[faces], np.zeros(garment.shape, np.float32)
-    np.add.at(area, faces, (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6)[:, None])
-    middle = np.mean(garment, axis=0, dtype=np.float32)  # from where products of positions lose least
-    at, seen = np.asarray(garment, np.float32) - middle, np.asarray(x, np.float32) - middle
-    own, reach = np.einsum("vi,vi->v", at, area), np.einsum("vi,vi->v", at, at)
+    a, b, c = (np.asarray(garment, np.float32)[faces[:, k]] for k in range(3))
+    area = np.zeros(garment.shape, np.float32)
+    np.add.at(area, faces, (np.cross(b - a, c - a) / 6)[:, None])
     found = np.zeros(len(x))
     for some in np.array_split(np.arange(len(x)), -(-len(x) * len(garment) // 1_000_000) or 1):
-        p = seen[some]
-        square = np.maximum(np.einsum("pi,pi->p", p, p)[:, None] + reach - 2 * p @ at.T, 1e-8)
-        found[some] = np.abs(np.sum((own - p @ area.T) / (square * np.sqrt(square)), axis=1)) / (4 * np.pi)
+        apart = np.asarray(garment, np.float32) - np.asarray(x, np.float32)[some, None]
+        cubed = np.maximum(np.einsum("pvi,pvi->pv", apart, apart), 1e-12) ** 1.5
+        found[some] = np.abs(np.sum(np.einsum("pvi,vi->pv", apart, area) / cubed, axis=1)) / (4 * np.pi)
     return found

@@ -13,7 +13,7 @@ from ncs_jax.geometry.surface_distance import closest_on_surface
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 
-__all__ = ["hanging", "hung_weights", "smooth_weights", "transfer_weights", "used_joints", "with_body_weights"]
+__all__ = ["hung_weights", "smooth_weights", "transfer_weights", "used_joints", "with_body_weights"]
 
 NEAR, FREE = 0.05, 0.15  # m; cloth that is nearer to the skin that it surrounds follows it as it lies; farther, it hangs free
 REACH, STEP = 2.0, 0.05  # times the nearest distance, and m; see `hung_weights`
@@ -33,11 +33,10 @@ def hung_weights(garment: GarmentRecord, body: BodyRecord, weights: np.ndarray) 
 
     over the skin that the garment surrounds (`enclosure`). Each joint counts by the solid angle that its skin takes of what the
     cloth sees; of the skin above it, as cloth hangs from that (s falls from 1 to 0 where the skin is `STEP` above to `STEP`
-    below); and of the skin that is not much farther than the nearest, d. h is how freely it hangs, see `hanging`. So a raised
-    thigh takes its side of a wide skirt along, and a bent knee hardly does. By the hips alone the thigh would pass through the
-    skirt, and no collision brings it back: cloth on either side of a limb is outside of it.
-
-    `weights`: w_lying (verts, joints), returned as they are where nothing hangs free.
+    below); and of the skin that is not much farther than the nearest, d. h rises from 0 to 1 where the cloth is `NEAR` to
+    `FREE` away from the skin. So a raised thigh takes its side of a wide skirt along, and a bent knee hardly does. By the hips
+    alone the thigh would pass through the skirt, and no collision brings it back: cloth on either side of a limb is outside of
+    it. `weights`: w_lying (verts, joints), returned as they are where nothing hangs free.
     """
     from scipy.spatial import cKDTree
 
@@ -48,7 +47,7 @@ def hung_weights(garment: GarmentRecord, body: BodyRecord, weights: np.ndarray) 
     inner = body.faces[within[body.faces].all(axis=1)]
     if not len(inner):
         return weights
-    hangs, _ = hanging(x, body.vertices, inner)
+    hangs = _smooth_step((np.linalg.norm(closest_on_surface(x, body.vertices, inner).gap, axis=1) - NEAR) / (FREE - NEAR))
     free = np.flatnonzero(hangs)
     corners = np.asarray(body.vertices, np.float64)[inner]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2  # times the area
@@ -64,15 +63,6 @@ def hung_weights(garment: GarmentRecord, body: BodyRecord, weights: np.ndarray) 
         mean = np.where(total > 0, seen @ of_face / np.where(total > 0, total, 1), result[some])
         result[some] += hangs[some, None] * (mean - result[some])
     return result
-
-
-def hanging(x: np.ndarray, skin: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how freely vertices (verts, 3) hang about a skin with its faces (faces, 3), m, and the ways from it to them, m.
-
-    It rises from 0 where the cloth is `NEAR` to 1 where it is `FREE` away.
-    """
-    gap = closest_on_surface(x, skin, faces).gap
-    return _smooth_step((np.linalg.norm(gap, axis=1) - NEAR) / (FREE - NEAR)), gap
 
 
 def _smooth_step(t: np.ndarray) -> np.ndarray:

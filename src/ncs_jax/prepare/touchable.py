@@ -16,7 +16,7 @@ from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest, resting_body
 
-__all__ = ["covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = ["bare_soles", "covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
 
 FRAMES = 60  # poses that are looked at, at most
 
@@ -44,8 +44,9 @@ def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, po
     return near
 
 
-COVER = 0.06  # m; a garment below covers the skin that is nearer to it,
-RIM = 0.1  # m; but none that is nearer to its rim
+SOLE, DOWN = 0.03, 0.5  # of the body's height; and cosine of a normal with what is down
+COVER = 0.06  # m; a garment covers the skin that is nearer to it;
+RIM = 0.1  # m; but one below none that is nearer to its rim
 
 
 def touchable_faces(model: Model, body: io.BodyRecord, part: np.ndarray) -> np.ndarray:
@@ -107,7 +108,7 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     """Return the numbers of the body vertices that the garment can touch in the scene's motions.
 
     They come near it as the body alone carries it (`touchable`), or it surrounds them at rest (`enclosure`): a wide skirt
-    stands off from the legs until it hangs.
+    stands off from the legs until it hangs. `bare_soles` are not among them.
     """
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
@@ -120,7 +121,22 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     near = touchable(body, garment.vertices, blend_from(weights), some, reach)
     far = np.flatnonzero(~near)
     near[far] = enclosure(body.vertices[far], garment.vertices, garment.faces) > ENCLOSED
-    return np.unique(body.faces[near[body.faces].any(axis=1)])
+    return np.setdiff1d(body.faces[near[body.faces].any(axis=1)], np.flatnonzero(bare_soles(body, garment.vertices)))
+
+
+def bare_soles(body: io.BodyRecord, garment: np.ndarray) -> np.ndarray:
+    """Return which vertices of a body (body,) are under its feet, with no cloth near them at rest, as a sock's is.
+
+    They are in the lowest `SOLE` of its height and face down. A hem that comes down on a foot lies on it; but where its
+    vertices are in the foot the sole may be nearest, and contact would push them under it, from where nothing brings them back.
+    """
+    from scipy.spatial import cKDTree
+
+    height, normals = body.vertices[:, 1] - body.vertices[:, 1].min(), vertex_normals(body.vertices, body.faces)
+    under = np.flatnonzero((height < SOLE * height.max()) & (normals[:, 1] < -DOWN))
+    bare = np.zeros(len(body.vertices), bool)
+    bare[under] = cKDTree(garment).query(body.vertices[under])[0] > COVER
+    return bare
 
 
 def submesh(faces: np.ndarray, kept: np.ndarray, verts: int) -> np.ndarray:

@@ -21,7 +21,6 @@ from ncs_jax.network.methods.method import Method
 from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animate
 from ncs_jax.prepare.build import Assembly
-from ncs_jax.prepare.outset import outset
 from ncs_jax.runs.pose_stiffness import find_stiffness, learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
@@ -30,7 +29,6 @@ from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, s
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
 from ncs_jax.training.programs import Programs
-from ncs_jax.training.set_out import set_out
 from ncs_jax.training.step import TrainState, chunk_runner, initial_state, refreshed
 
 __all__ = ["PlacedScene", "begin_programs"]
@@ -66,18 +64,10 @@ class PlacedScene:
     def initial_state(self, params: dict | None = None) -> TrainState:
         """Return the state that the seed gives, in this process alone; with parameters of another run, if there are any.
 
-        These are copied, as training uses up the arrays of its state. A fresh garment begins outside of limbs, see `outset`.
+        These are copied, as training uses up the arrays of its state.
         """
-        network, model = self.assembly.network, self.model
-        state = initial_state(model, network, self.seed)
-        if params is not None:
-            return replace(state, params=jax.tree.map(jnp.array, params))
-        found = outset(model, self.features, None if model.vibrations is None else model.vibrations.drape)
-        if found is None:
-            return state
-        frames, offsets = found
-        part = replace(jax.tree.map(lambda a: a[frames], self.features), origin=None)
-        return replace(state, params=set_out(model, network, state.params, part, offsets))
+        state = initial_state(self.model, self.assembly.network, self.seed)
+        return state if params is None else replace(state, params=jax.tree.map(jnp.array, params))
 
     def copied(self, tree):
         """Return the first process's arrays on every device."""
