@@ -248,7 +248,7 @@ def _scene(options, out: Path, found, body) -> str:
     contact, usual = found.contact, Scene().physics.collision
     told = [f"{n} = {getattr(contact, n):g}" for n in ("thickness", "stiffness") if getattr(contact, n) != getattr(usual, n)]
     told = [f"{told[0]}  # for edges of {1000 * contact.edge:.0f} mm, else skin shows between them", *told[1:]] if told else []
-    lines += ["", "[physics.collision]", *told] if told else []
+    lines += ["", "[physics.collision]", *told, 'points = "auto"'] if told else []
     if body.frames is None:
         lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]
     return "\n".join(lines) + "\n"
