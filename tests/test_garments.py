@@ -350,7 +350,7 @@ def test_a_garment_across_the_body_is_refused_unless_the_scene_says_so():
 
 def test_a_garment_of_the_right_but_unusual_unit_that_lies_down_is_told_its_axis():
     x = grid()[0] @ np.array(TURNED["z"])
-    with pytest.raises(InputError, match=r'it looks like Z up: write up = "z" below .*, or let ncs fit find'):
+    with pytest.raises(InputError, match=r'let ncs fit find .*suit Z up: if it is so, write up = "z" below'):
         check_on_body(Path("g.npz"), garment(x, scale=0.1), post()["vertices"], axis_given=False)
 
 
@@ -365,7 +365,7 @@ def test_a_garment_that_nothing_brings_onto_the_body():
 @pytest.mark.parametrize(("given", "words"), [
     ({"scale_given": True, "axis_given": True}, "move it into the body's coordinates, or mend garment.up"),
     ({"scale_given": True, "axis_given": False}, 'if its axes are others, write up = "x" below'),
-    ({"scale_given": False, "axis_given": True}, "it looks like centimetres: write scale = 0.01 below"),
+    ({"scale_given": False, "axis_given": True}, "would suit centimetres: if it is so, write scale = 0.01 below"),
 ])  # fmt: skip
 def test_what_the_scene_states_is_not_guessed_at(given, words):
     """A sheet in inches that is 0.3 m above the body, where one in cm would be on it; and one that X up would bring."""

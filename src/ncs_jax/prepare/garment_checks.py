@@ -97,8 +97,9 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
     """Raise an InputError unless a garment has about the size of the body, lies on it, and stands upright as it does.
 
     The message names the unit and the axis that would bring the garment onto the body, found by the boxes around both. They
-    are not applied: a box cannot tell a garment in inches from a large one, and the whole training depends on them. A scene
-    file that states them means the same with every body. What the scene states is not guessed at.
+    are not applied: a box cannot tell a garment in inches from a large one, nor a dress from a doll's at the thigh, and the
+    whole training depends on them. A scene file that states them means the same with every body. What the scene states is not
+    guessed at.
 
     Args:
         file: the garment's, for errors. garment: as read. body: vertices (V, 3), m. axis_given, scale_given: the scene states
@@ -150,8 +151,8 @@ def _mend(garment: GarmentRecord, body: np.ndarray, told: tuple[bool, bool]) -> 
                 if told[0]:
                     other = f"if its axes are others, write {fields[0]} below [garment] in the scene file"
                     return f"bring it there by ncs fit, or, {other}"
-                guess = f"it looks like {', '.join(words)}: write {' and '.join(fields)} below [garment] in the scene file"
-                return f"{guess}, or let ncs fit find its unit, axes and place"
+                guess = f"its box would suit {', '.join(words)}: if it is so, write {' and '.join(fields)} below [garment]"
+                return f"let ncs fit find its unit, axes and place; {guess} in the scene file"
     return ""
 
 

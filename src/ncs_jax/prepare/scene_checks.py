@@ -25,6 +25,7 @@ from ncs_jax.prepare.reference_pose import ZERO
 from ncs_jax.prepare.setting import RECURRENT, Setting
 from ncs_jax.prepare.speed_checks import frame_jumps, speed_faults
 from ncs_jax.prepare.touchable import touchable_faces
+from ncs_jax.prepare.wearing import wearing_faults
 from ncs_jax.scene.model import Model, resting_body
 from ncs_jax.scene.spec import Scene
 
@@ -274,6 +275,7 @@ def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
+        found += [Risk(*fault) for fault in wearing_faults(a.garment, body)]
         found += _shows(a, faces)
     found += [*_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:

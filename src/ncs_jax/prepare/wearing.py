@@ -11,14 +11,16 @@ import numpy as np
 from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.prepare.retarget import body_names
 
-__all__ = ["Cloth", "Skin", "cloth_of", "large_loops", "pierced", "skin_of", "threaded"]
+__all__ = ["Cloth", "Skin", "cloth_of", "large_loops", "pierced", "skin_of", "threaded", "wearing_faults"]
 
 POINTS = 20000  # that stand for the skin
 STEP = 1 / 80  # of the body's height: bones are followed in such steps
 PLACES = 1 / 32  # of the body's height: distance of the places at which a garment is tried
 CELL = 1 / 40  # of the body's height: side of a cell of the grid
 FAR = 1 / 8  # of the body's height: cloth that is farther from the skin is told to be infinitely far
+NAMED = 6  # joints that a fault names
 SMALL = 1 / 12  # of the body's height: an opening that is shorter is a buttonhole
 OFF = np.array([1.3e-4, 0.7e-4, 2.1e-4])  # m; a bone must not run along the symmetric edges of a mesh
 
@@ -187,3 +189,19 @@ def _even(x: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.
     u, v = np.where(u + v > 1, [1 - u, 1 - v], [u, v])
     points = a[at] + u[:, None] * (b - a)[at] + v[:, None] * (c - a)[at]
     return points, cross[at] / np.maximum(double[at], 1e-30)[:, None], float(double.sum() / 2)
+
+
+def wearing_faults(garment: GarmentRecord, body: BodyRecord) -> Iterator[tuple[str, str, str, str]]:
+    """Yield why a body at rest does not wear a garment, each as what, its value, what follows, and the mend: bones that pass
+    through its cloth, and openings of which none has the body in it."""
+    skin, x = skin_of(body), garment.vertices.astype(np.float64)
+    names, mend = body_names(body), "ncs fit finds its unit, axes and place"
+    if bones := pierced(x, garment.faces, skin):
+        value = ", ".join(names[j] if names else f"joint {j}" for j in bones[:NAMED])
+        more = f" and {len(bones) - NAMED} more" if len(bones) > NAMED else ""
+        yield "bones through the cloth at rest", value + more, "contact can push it off on no side", mend
+    loops = [x[loop] for loop in boundary_loops(garment.faces)]
+    large = len(large_loops(loops, skin))
+    if large > 1 and len(skin.bones) and not threaded(loops, skin):
+        value = f"none of its {large} has the body in it at rest"
+        yield "openings of the garment", value, "it is beside the body, or across it, and not worn", mend
