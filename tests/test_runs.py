@@ -17,9 +17,10 @@ import pytest
 
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.rollout import stepper
+from ncs_jax.runs import train as runs_train
 from ncs_jax.runs.begin import assemble_run
-from ncs_jax.runs.checkpoint import Checkpoints, write_run
-from ncs_jax.runs.plan import EARLY, Costs, steps_within
+from ncs_jax.runs.checkpoint import Checkpoints, read_run, write_run
+from ncs_jax.runs.plan import EARLY, Costs, Minutes, steps_within
 from ncs_jax.runs.pose_stiffness import poses_of
 from ncs_jax.runs.run import Run, assemble, load_run
 from ncs_jax.runs.train import train
@@ -249,6 +250,30 @@ def test_steps_within_a_time_count_everything_that_takes_time():
                 assert last == first + 10 or 1.05 * seconds(costs, first, last) <= allowed
                 assert 1.05 * seconds(costs, first, last + 10) > allowed - 4 - (costs is slow) * 66
     assert steps_within(180, slow) == 10 and steps_within(180, quick) > 10_000 / 2
+
+
+def test_a_time_is_kept_where_steps_take_another_time_than_was_measured():
+    timed = Minutes(Costs(0.1, 0.0, 0.0, 0.0, 200, 200), 0, 100.0)
+    last = steps_within(timed.seconds, timed.costs)
+    assert timed.last(120, 120 * 0.105, last) == last == 950
+    assert timed.last(120, 120 * 0.05, last) == pytest.approx(120 + 94 / 0.0525, abs=10)
+    assert timed.last(120, 120 * 0.2, last) == pytest.approx(120 + 76 / 0.21, abs=10)
+    assert timed.last(120, 120 * 0.8, last) == 260  # its stiffness is found at half
+    later = timed._replace(first=900)  # of a run that is resumed
+    assert later.last(1020, 120 * 0.8, 1850) == pytest.approx(1020 + 4 / 0.84, abs=10)
+
+
+@pytest.mark.filterwarnings("ignore:0.05 minutes hold")
+@pytest.mark.parametrize("step", [0.1, 0.003])
+def test_minutes_that_were_measured_wrongly_are_planned_anew(tmp_path, plain_jax, monkeypatch, step):
+    """A step of this scene takes some 15 ms."""
+    scene, seen, out = write_scene(tmp_path, FREE), [], tmp_path / "run"
+    measure = runs_train.measure_costs
+    monkeypatch.setattr(runs_train, "measure_costs", lambda *a: measure(*a)._replace(step=step, checkpoint=0, lists=0))
+    run = train(scene, out, minutes=0.05, report=seen.append)
+    first, last = seen[0].steps, seen[-1].steps
+    assert (last > 1.3 * first) if step > 0.05 else (last < 0.8 * first)
+    assert run.steps == last == load_run(out).steps == seen[-1].step and read_run(out)["steps"] == last
 
 
 def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):

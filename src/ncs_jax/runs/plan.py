@@ -16,12 +16,14 @@ from ncs_jax.runs.pose_stiffness import poses_of
 from ncs_jax.training.batches import CHUNK, whole_chunks
 from ncs_jax.training.step import TrainState
 
-__all__ = ["EARLY", "ENOUGH", "Costs", "measure_costs", "steps_within"]
+__all__ = ["EARLY", "ENOUGH", "LOOKS", "Costs", "Minutes", "measure_costs", "steps_within"]
 
 ENOUGH = 300  # steps; after fewer, a garment still looks as it did at the start
 EARLY = (20, 50, 100)  # after so many steps, in which a garment falls farthest, its contacts are looked at once more
 MOST = 10_000_000  # steps
 MARGIN = 1.05  # of the time that is measured
+LOOKS = 1 / 8, 3 / 8  # of the steps: whether they take the time that was measured is looked at here, before the stiffness is
+OTHER = 0.1  # by this share slower or faster than measured, and the rest is planned anew
 SLOW = 5.0  # s; a chunk that takes longer is timed once
 
 
@@ -39,14 +41,34 @@ class Costs(NamedTuple):
     checkpoint_every: int
     stiffness: float = 0.0
 
-    def seconds(self, first: int, last: int) -> float:
-        """Return how long the steps first to last take."""
-        validations = -(-last // self.validate_every) - first // self.validate_every
-        checkpoints = -(-last // self.checkpoint_every) - first // self.checkpoint_every
+    def seconds(self, first: int, last: int, *, ends: bool = True) -> float:
+        """Return how long the steps first to last take; `ends`: the run ends there."""
+        validations, checkpoints = (
+            (-(-last // every) if ends else last // every) - first // every
+            for every in (self.validate_every, self.checkpoint_every)
+        )
         lists = sum(first < step <= last for step in EARLY) + last // self.checkpoint_every - first // self.checkpoint_every
-        poses = poses_of(last) * (1 + (whole_chunks(last // 2) > first))
+        poses = ends * poses_of(last) * (1 + (whole_chunks(last // 2) > first))
         rare = validations * self.validation + checkpoints * self.checkpoint + lists * self.lists + poses * self.stiffness
         return MARGIN * ((last - first) * self.step + rare)
+
+
+class Minutes(NamedTuple):
+    """A run from a step on that is to take some seconds, by what was measured before: another program may have run then."""
+
+    costs: Costs
+    first: int
+    seconds: float
+
+    def last(self, done: int, spent: float, last: int) -> int:
+        """Return at which step the run ends, after `spent` seconds at step `done`: at `last`, unless its steps take another
+        time than was measured. Half of it stays ahead if it is."""
+        slower = spent * MARGIN / self.costs.seconds(self.first, done, ends=False)
+        if abs(slower - 1) < OTHER:
+            return last
+        return max(
+            steps_within((self.seconds - spent) / slower, self.costs, done), 2 * (done + CHUNK) if last > 2 * done else 0
+        )
 
 
 def steps_within(seconds: float, costs: Costs, first: int = 0) -> int:

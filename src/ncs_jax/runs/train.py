@@ -28,7 +28,7 @@ from ncs_jax.runs.begin import assemble_run, facts_of_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, read_trained, write_prepared, write_run, write_trained
 from ncs_jax.runs.log import Report, RunLog
 from ncs_jax.runs.placed_scene import PlacedScene, begin_programs
-from ncs_jax.runs.plan import EARLY, ENOUGH, measure_costs, steps_within
+from ncs_jax.runs.plan import EARLY, ENOUGH, LOOKS, Minutes, measure_costs, steps_within
 from ncs_jax.runs.run import NetworkMaker, Run, assemble, load_run, own_names
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.training.batches import CHUNK, chunks, whole_chunks
@@ -139,9 +139,9 @@ def train_assembly(
         if begun.params is not None and begun.facts is None:
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
-        last = _planned(placed, output, state, steps, minutes)
+        last, timed = _planned(placed, output, state, steps, minutes)
         trained = output.keep_motion()
-        return _Loop(placed, output, placed.copied(state), last, begun.since, settle).run(trained)
+        return _Loop(placed, output, placed.copied(state), last, begun.since, settle).run(trained, timed)
 
 
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
@@ -152,14 +152,17 @@ def _check_options(steps: int | None, minutes: float | None, resume: bool, start
         raise InputError("a run that is resumed has weights", field="--from", value=str(start), mend="leave it out")
 
 
-def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int | None, minutes: float | None) -> int:
-    """Return at which step a run ends that stands at a state, and write it into run.json."""
-    last = steps or output.planned or placed.assembly.scene.training.steps
+def _planned(
+    placed: PlacedScene, output: _Output, state: TrainState, steps: int | None, minutes: float | None
+) -> tuple[int, Minutes | None]:
+    """Return at which step a run ends that stands at a state, and by what time if by time, and write it into run.json."""
+    last, timed = steps or output.planned or placed.assembly.scene.training.steps, None
     if minutes is not None:
         assembly = placed.assembly
         validate = functools.partial(_validate, Run(assembly, state.params)) if assembly.scene.motion.validation else None
         costs = measure_costs(placed, state, validate, output.seconds_of_a_checkpoint(state))
-        last = int(placed.copied(steps_within(60 * minutes, costs, int(state.step))))
+        timed = Minutes(costs, int(state.step), 60 * minutes)
+        last = int(placed.copied(steps_within(timed.seconds, costs, timed.first)))
         if last < ENOUGH and not output.started and jax.process_index() == 0:
             needed = math.ceil(costs.seconds(int(state.step), ENOUGH) / 60)
             upto = f", up to step {last}" if state.step else ""
@@ -168,7 +171,7 @@ def _planned(placed: PlacedScene, output: _Output, state: TrainState, steps: int
             warnings.warn(f"{what}; {ENOUGH} steps in all take about {needed} minutes{more}", InputWarning, stacklevel=4)
     if last != output.planned:
         output.plan(last)
-    return last
+    return last, timed
 
 
 class _Output:
@@ -269,15 +272,24 @@ class _Loop:
         self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
         self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
 
-    def run(self, trained: TrainedMotion) -> Run:
-        """Take every step that is left, and return the garment, trained on motions of which this is kept."""
-        placed = self._placed
+    def run(self, trained: TrainedMotion, timed: Minutes | None = None) -> Run:
+        """Take every step that is left, and return the garment, trained on motions of which this is kept.
+
+        timed: the time that it is to take; its end is planned anew where its steps take another time than was measured.
+        """
+        placed, start, done, looks = self._placed, time.monotonic(), self._first, list(LOOKS if timed else ())
         placed.refresh(placed.local(self._state.params), self._first)
         if self._first:
             placed.rebuild_lists(placed.local(self._state.params))
         self._output.begin_log(self._first)
-        for at, count in chunks(self._first, self._steps):
+        while done < self._steps:
+            at, count = next(chunks(done, self._steps))
             self._take(at, count)
+            done = at + count
+            if timed and looks and looks[0] * (self._steps - self._first) <= done - self._first < self._steps - self._first:
+                del looks[0]
+                self._steps = int(placed.copied(timed.last(done, time.monotonic() - start, self._steps)))
+                self._output.plan(self._steps)
         return Run(placed.assembly, placed.local(self._state.params), self._steps, trained=trained)
 
     def _take(self, at: int, count: int) -> None:
