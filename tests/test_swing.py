@@ -19,7 +19,7 @@ from ncs_jax.network.methods.swing import QUIET, Swing, stiffness
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import BEYOND, features_from_records
 from ncs_jax.prepare.setting import with_cell
-from ncs_jax.runs.pose_stiffness import FEWEST, fitted
+from ncs_jax.runs.pose_stiffness import FEWEST, fitted, poses_of
 from ncs_jax.runs.train import IDLE
 from ncs_jax.scene.model import RitzModes, local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
@@ -384,6 +384,10 @@ def test_what_is_fitted_is_a_map_of_the_descriptors_and_keeps_to_what_was_found(
     rows = [0, 2, 5]  # of the diagonal
     assert np.all(diagonal > by_pose[6, rows] - 1e-9) and np.all(diagonal < by_pose[7, rows] + 1e-9)
     np.testing.assert_array_equal(told(None, d), np.tile(np.eye(modes), (poses, 1, 1)))
+
+
+def test_in_how_many_poses_a_training_looks():
+    assert [poses_of(steps) for steps in (250, 256, 1000, 2000, 100_000)] == [0, 16, 16, 31, 128]
 
 
 def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):

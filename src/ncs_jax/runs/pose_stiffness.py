@@ -23,21 +23,22 @@ __all__ = ["find_stiffness", "learn_pose_stiffness", "poses_of"]
 MOST = 128  # poses: by then the map explains 3 quarters of what differs between a skirt's
 FEWEST = 16  # poses that a map is fitted to
 STEPS = 64  # of training for each pose, so that they take about a twentieth of its time
+SHARE = 4  # times as much of a short training may go into `FEWEST`; a shorter one leaves it out
 RIDGES = 10.0 ** np.arange(-4, 3)  # of the mean square of the descriptors
 
 
 def poses_of(steps: int) -> int:
     """Return in how many poses a training of so many steps looks, twice."""
-    return min(MOST, steps // STEPS) if steps // STEPS >= FEWEST else 0
+    return min(MOST, max(FEWEST, steps // STEPS)) if SHARE * steps >= FEWEST * STEPS else 0
 
 
 def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures, steps: int, seed: int) -> Assembly:
     """Return a garment whose swing knows how stiff the garment is in a pose, as the network now has the garment.
 
-    K is found by `stiffness_in_pose` in some poses of the training, one in `STEPS` steps, at most `MOST`; its Cholesky factor
-    is fitted by ridge regression on the poses' descriptors, the ridge chosen by leaving each pose out, for
-    `methods.swing.stiffness`. Between what was found in the poses it is bounded. What bounds a swing is found anew with it.
-    A network that does not swing, and a training too short for `FEWEST` poses, leave all as it is.
+    K is found by `stiffness_in_pose` in some poses of the training, see `poses_of`; its Cholesky factor is fitted by ridge
+    regression on the poses' descriptors, the ridge chosen by leaving each pose out, for `methods.swing.stiffness`. Between what
+    was found in the poses it is bounded. What bounds a swing is found anew with it. A network that does not swing, and a
+    training too short for that, leave all as it is.
     """
     network, model = assembly.network, assembly.model
     count = min(poses_of(steps), len(track.start))
