@@ -28,7 +28,7 @@ def matrix(given: dict) -> np.ndarray:
 def bind_pose(hero: Hero, at: np.ndarray | None = None) -> fbx.Node:
     """The matrices of armature and bones when they were bound, or of another time, when all of them were elsewhere."""
     bones = {20 + j: m for j, m in enumerate(hero.globals(np.zeros((3, 3))))}
-    lines = [
+    lines: list = [
         ("PoseNode", [], [("Node", [key], None), ("Matrix", [((np.eye(4) if at is None else at) @ m).T.ravel().copy()], None)])
         for key, m in ({10: hero.armature} | bones).items()
     ]
