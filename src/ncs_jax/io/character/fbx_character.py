@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.io.character.fbx import Record, read_fbx
+from ncs_jax.io.character.fbx_bind import carriers
 from ncs_jax.io.character.fbx_curve import Curve, curve_from
 from ncs_jax.io.character.fbx_graph import FbxModel, Graph, euler, graph_of, name_of, properties_of
 from ncs_jax.io.character.fbx_mesh import fbx_meshes, fbx_pieces, fbx_texture_coordinates, fbx_triangles
@@ -36,10 +37,11 @@ def fbx_body(path: str | Path, part: Sequence[str] = (), shapes: Mapping[str, fl
     """
     with reading(Path(path), "FBX"):
         graph = graph_of(read_fbx(path))
-        pieces = fbx_pieces(graph, part, shapes)
+        worlds = _worlds(graph)
+        pieces = fbx_pieces(graph, worlds, part, shapes)
         if not pieces:
             raise graph.fbx.wrong("a skinned mesh expected", "skins", "none", "export the character with its skin")
-        return body_of(rig_from(graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces))
+        return body_of(rig_from(graph.fbx.file, [m.name for m in graph.models], graph.parents, worlds, pieces))
 
 
 def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
@@ -61,7 +63,7 @@ def fbx_garment(path: str | Path, mesh: Sequence[str] = ()) -> RawGarment:
         worlds = _worlds(graph)
         if all(d.skin is not None for d in worn):
             names = [m.name for m in graph.models]
-            rig = rig_from(file, names, graph.parents, worlds, fbx_pieces(graph, worn=worn))
+            rig = rig_from(file, names, graph.parents, worlds, fbx_pieces(graph, worlds, worn=worn))
             return RawGarment(
                 file, rig.vertices, rig.faces, rig.uv, weights=rig.weights, joint_names=rig.names, notes=rig.notes
             )
@@ -81,17 +83,20 @@ def fbx_motion(path: str | Path, name: str = "") -> MotionRecord:
 
     The rate is the one that the file states, else that of its keys, as in glTF.
     Joints without curves keep their model's place. In a file without a skin (Mixamo's "Without Skin"), the rest pose is the one
-    in which the models stand.
+    in which the models stand; where that is a frame, the root's way aside in it belongs to the path.
     """
     with reading(Path(path), "FBX"):
         graph = graph_of(read_fbx(path))
         begin, end, curves, notes = _animation(graph, name)
-        pieces = fbx_pieces(graph)
+        worlds = _worlds(graph)
+        pieces = fbx_pieces(graph, worlds)
         turning = [m for (m, p, _), c in curves.items() if p == "Lcl Rotation" and np.ptp(c.values) > 0.01]
-        rig = rig_from(
-            graph.fbx.file, [m.name for m in graph.models], graph.parents, _worlds(graph), pieces, sorted(set(turning))
-        )
+        names = [m.name for m in graph.models]
+        rig = rig_from(graph.fbx.file, names, graph.parents, worlds, pieces, sorted(set(turning)))
         wanted = rig.nodes.tolist()
+        if not pieces:
+            above = carriers(graph, wanted[:1])
+            rig = replace(rig, carrier=worlds[above[0], :3, 3] if above else np.zeros(3))
         fps = graph.fps or key_rate(c.times for c in curves.values())
         found = motion_of(rig, (begin, end, fps), lambda times: _worlds(graph, wanted, curves, times))
         return replace(found, notes=(*notes, *found.notes))

@@ -23,10 +23,11 @@ KINDS = tuple(f"{kind}::" for kind in ("Model", "AnimStack", "Geometry", "Materi
 
 @dataclass(frozen=True, eq=False)
 class FbxModel:
-    """A node. Its properties come from the node itself, else from the file's template."""
+    """A node, of a kind as LimbNode or Null. Its properties come from the node itself, else from the file's template."""
 
     key: int
     name: str
+    kind: str
     properties: dict[str, list]
 
     def vector(self, name: str, default: float = 0.0) -> np.ndarray:
@@ -90,7 +91,10 @@ def graph_of(fbx: Fbx) -> Graph:
             depth[i] = steps
     order = np.argsort(depth, kind="stable")
     rank = np.argsort(order)
-    models = [FbxModel(keys[i], name_of(objects[keys[i]]), template | properties_of(objects[keys[i]])) for i in order]
+    models = [
+        FbxModel(k, name_of(objects[k]), objects[k].value(2, str, ""), template | properties_of(objects[k]))
+        for k in (keys[i] for i in order)
+    ]
     parents = np.array([rank[parents[i]] if parents[i] >= 0 else -1 for i in order], np.int32)
     return Graph(fbx, models, parents, objects, below, *_settings(fbx))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ncs_jax.io.character.fbx import Record
+from ncs_jax.io.character.fbx_bind import bind_pose, bound_now
 from ncs_jax.io.character.fbx_graph import Graph, euler, name_of, properties_of
 from ncs_jax.io.character.rig import Piece
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes
@@ -42,11 +43,15 @@ def fbx_meshes(graph: Graph) -> list[FbxMesh]:
 
 def fbx_pieces(
     graph: Graph,
+    worlds: np.ndarray,
     part: Sequence[str] = (),
     shapes: Mapping[str, float] | None = None,
     worn: Sequence[FbxMesh] = (),
 ) -> list[Piece]:
-    """Return the triangles under each skin, chosen by `part` or `worn`; the others are there too: they tell of the joints."""
+    """Return the triangles under each skin, chosen by `part` or `worn`; the others are there too: they tell of the joints.
+
+    `worlds`: (N, 4, 4) of all models as they stand, m.
+    """
     drawn = [d for d in fbx_meshes(graph) if d.skin is not None]
     chosen = chosen_meshes(graph.fbx.file, "body.part", part, [d.named for d in drawn])
     if worn:
@@ -55,7 +60,8 @@ def fbx_pieces(
     for name in shapes or {}:
         if name not in known:
             raise graph.fbx.wrong("no such shape", "body.shapes", name, f"the file has {', '.join(known)[:600] or 'none'}")
-    pieces = [replace(_piece(graph, d, shapes or {}), chosen=c) for d, c in zip(drawn, chosen.tolist(), strict=True)]
+    stand = worlds, bind_pose(graph) if drawn else {}
+    pieces = [replace(_piece(graph, stand, d, shapes or {}), chosen=c) for d, c in zip(drawn, chosen.tolist(), strict=True)]
     maps = [fbx_texture_coordinates(graph, d) if worn and c else None for d, c in zip(drawn, chosen.tolist(), strict=True)]
     return [replace(piece, uv=uv) for piece, uv in zip(pieces, maps, strict=True)]
 
@@ -129,13 +135,13 @@ def fbx_texture_coordinates(graph: Graph, mesh: FbxMesh) -> np.ndarray | None:
     return None if number.min() < 0 else table.reshape(-1, 2)[number[cut]]  # -1: the corner has none
 
 
-def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
-    """Return the triangles of one mesh with the joints and weights of its skin."""
+def _piece(graph: Graph, stand: tuple[np.ndarray, dict[int, np.ndarray]], mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
+    """Return the triangles of one mesh with the joints and weights of its skin; `stand`: models to the world, now and bound."""
     fbx, model = graph.fbx, graph.models[mesh.model]
     where, place = f"mesh of {model.name}", {m.key: i for i, m in enumerate(graph.models)}
     x, faces = fbx_triangles(graph, mesh, shapes)
     rows: list[tuple[np.ndarray, np.ndarray]] = []
-    nodes, binds, bounds = [], [], []
+    nodes, binds, links = [], [], []
     for key, cluster, _ in graph.under(mesh.skin or 0, "Deformer", "Cluster"):
         bones = [place[k] for k, _, _ in graph.under(key, "Model")]
         own = fbx.array(cluster, "Indexes", where, whole=True), fbx.array(cluster, "Weights", where)
@@ -150,7 +156,7 @@ def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
         rows.append(own)
         nodes.append(bones[0])
         binds.append(to_bone.reshape(4, 4).T)
-        bounds.append(graph.to_metres @ to_world.reshape(4, 4).T @ binds[-1])
+        links.append(graph.to_metres @ to_world.reshape(4, 4).T)
     if not nodes or min((r[0].min() for r in rows if r[0].size), default=-1) < 0:
         raise fbx.wrong("vertices that joints move expected", where, f"{len(nodes)} joints")
     vertex, weight = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
@@ -163,4 +169,8 @@ def _piece(graph: Graph, mesh: FbxMesh, shapes: Mapping[str, float]) -> Piece:
     owners[vertex, slot], weights[vertex, slot] = owner, np.maximum(weight, 0)
     sums = weights.sum(axis=1, keepdims=True)
     weights /= np.where(sums > 1e-6, sums, 1)  # a skin of FBX divides by the sum
-    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bounds[0])
+    bound = links[0] @ binds[0]
+    moving = np.argsort([not r[1].any() for r in rows], kind="stable")  # those that move a vertex come first
+    carried = bound_now(graph, *stand, [nodes[k] for k in moving], np.array(links)[moving])
+    rests = None if carried is None else carried @ bound
+    return Piece(x, faces, owners, weights, np.array(nodes), np.array(binds), bound, rests)

@@ -64,7 +64,8 @@ def gltf_body(path: str | Path, part: Sequence[str] = (), shapes: Mapping[str, f
 
     All meshes under a skin are joined, or those that `part` names by object, mesh or material. Morph targets have the file's
     weights, or those of `shapes`. Vertices that differ only in texture coordinates and normals are merged. Meshes without a
-    skin are ignored.
+    skin are ignored. The format does not say where a skin was bound: a character whose nodes were all moved together by a pose
+    of the hips stands where that pose has it.
     """
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):
@@ -132,7 +133,7 @@ def gltf_motion(path: str | Path, name: str = "") -> MotionRecord:
 
     The frames are the keys, if they have a constant rate of 10 to 240 a second; else there are 30 a second, from the first key
     to the last. Joints without keys keep their node's place. In a file without a skin, the rest pose is the one in which the
-    nodes stand.
+    nodes stand; where that is a frame, the root's way aside in it belongs to the path.
     """
     gltf = read_gltf(path)
     with reading(gltf.file, "glTF"):

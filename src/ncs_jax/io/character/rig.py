@@ -38,7 +38,8 @@ class Piece:
     Attributes:
         vertices: (V, 3) in the space where they were bound. faces: (F, 3). owners, weights: (V, K), numbers into `nodes`, and
             how much each moves the vertex. nodes: (S,) of the file. inverse_binds: (S, 4, 4) from that space to each node.
-            bound: (4, 4) from that space to the world, None where the file does not say. chosen: whether the triangles are
+            bound: (4, 4) from that space to the world, None where the file does not say. rests: the same where the file
+            tells a pose of the bones from a move of what is above them, else None. chosen: whether the triangles are
             wanted, or only what they tell of the joints. uv: (F, 3, 2) texture coordinates of the triangles' corners, or None.
     """
 
@@ -49,6 +50,7 @@ class Piece:
     nodes: np.ndarray
     inverse_binds: np.ndarray
     bound: np.ndarray | None = None
+    rests: np.ndarray | None = None
     chosen: bool = True
     uv: np.ndarray | None = None
 
@@ -61,7 +63,7 @@ class Rig:
         file: the path. nodes: (J,) the file's nodes that are the joints. names: their names. parents: (J,), -1 for the root.
             binds: (J, 4, 4) joint to world in the bind pose. used: (J,) whether a joint, or one below it, moves some vertex.
             vertices: (V, 3). faces: (F, 3). weights: (V, J). A file without a skin has no vertices. notes: what was mended.
-            uv: (F, 3, 2) or None, as of the pieces.
+            uv: (F, 3, 2) or None, as of the pieces. carrier: (3,) the place of what carries a skeleton without skin.
     """
 
     file: Path
@@ -75,6 +77,7 @@ class Rig:
     weights: np.ndarray
     notes: tuple[str, ...] = ()
     uv: np.ndarray | None = None
+    carrier: np.ndarray | None = None
 
 
 def together(uv: Sequence[np.ndarray | None]) -> np.ndarray | None:
@@ -99,9 +102,9 @@ def rig_from(
 
     Joints rest where the inverse bind matrices say, and not where the nodes stand: only from there do the joints' movements
     give the skin as the file means it. Nodes may stand in any pose; exporters leave some frame in them. Where the bound
-    character stands in the world is what the joints' nodes agree on, if they are in the bind pose; else where the file says
-    that the skin was bound (FBX); else the place of the root's node, with the turn of the armature or the quarter turn that is
-    nearest to the mean turn of the joints.
+    character stands in the world is what the joints' nodes agree on, unless the file tells that all of them were posed together
+    (FBX, see `bound_now`); if they do not agree, where the file says that the skin was bound (FBX); else the place of the
+    root's node, with the turn of the armature or the quarter turn that is nearest to the mean turn of the joints.
 
     Weights are divided by their sum; a vertex without follows the nearest that has some. See `_bound` for identity matrices.
     The root is the lowest node above all joints that move a vertex. A root bone of the file that moves no vertex, and below
@@ -157,10 +160,11 @@ def _rig_without_skin(file: Path, names: Sequence[str], parents: np.ndarray, res
         trees.setdefault(path_to_root(parents, node)[-1], []).append(node)
     root = lowest_common(parents, max(trees.values(), key=len))  # cameras and lights may turn beside the skeleton
     joints = by_depth(parents, [n for n in range(len(parents)) if root in path_to_root(parents, n)])
-    none = np.zeros((0, 3))
+    none, above = np.zeros((0, 3)), int(parents[root])
     return Rig(
         file, np.array(joints), unique_names([names[n] for n in joints]), nearest_parents(parents, joints), rest[joints],
         np.ones(len(joints), bool), none, none.astype(np.int32), none[:, :0],
+        carrier=rest[above, :3, 3] if above >= 0 else np.zeros(3),
     )  # fmt: skip
 
 
@@ -232,7 +236,7 @@ def _to_world(
     size = np.linalg.norm(ends[:, 1] - ends[:, 3], axis=1).max()
     apart = np.abs(ends - ends[:1]).max(axis=(1, 2))
     if apart.max() <= SAME * size:
-        return found[0]
+        return found[0] if already or piece.rests is None else piece.rests
     if already:
         raise InputError(
             "one bind pose for all meshes expected", file=file, value=f"{apart.max():.3g} m apart",

@@ -20,6 +20,7 @@ from ncs_jax.io.tables.files import LARGEST
 
 __all__ = ["clip_named", "first_that_moves", "motion_of", "split_clip"]
 
+ASIDE = 0.05  # of a skeleton's size: roots that rest within that of its origin are taken to rest where they stand
 GIVE = 0.01  # m by which a bone may change, and share by which a joint may scale; more is an error, less is ignored
 HOUR = 3600.0  # s; the longest animation
 BLOCK = 256  # frames evaluated at once
@@ -107,6 +108,8 @@ def motion_of(rig: Rig, times: tuple[float, float, float], worlds: Callable[[np.
         resized |= scaled
     world, place = np.concatenate(turned), np.concatenate(placed)
     joints, kept, notes = _settled(rig, props, world, place)
+    shift, said = _aside(rig, kept, world, place)
+    joints, notes = joints - shift, (*notes, *said)
     if held := [rig.names[j] for j in kept if resized[j]]:
         notes = (*notes, f"props that change their size keep that at rest, as joints only turn: {', '.join(held[:8])}")
     rest, parents = rest_rotations(rig)[kept], nearest_parents(rig.parents, kept)
@@ -157,6 +160,25 @@ def _settled(
         gone = ", ".join(n for j, n in enumerate(rig.names) if j not in kept)
         notes = (f"{rig.names[kept[0]]} carries the path, so it is the root; left out: {gone[:200]}", *notes)
     return joints[kept], kept, notes
+
+
+def _aside(rig: Rig, kept: list[int], world: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return how far aside a skeleton without a skin stands in the frame in which it was written, (3,) m, and notes.
+
+    Such a file has no rest pose but the one in which its nodes stand. Where that is a frame of the motion, the root's way aside
+    is a part of the path, as it is for a character with its skin: at rest the root is above what carries the skeleton.
+    """
+    none, own = np.zeros(3), rig.binds[kept, :3, 3]
+    aside = none if rig.carrier is None else (own[0] - rig.carrier) * (1, 0, 1)
+    far = float(np.linalg.norm(aside))
+    if far <= ASIDE * np.ptp(own, axis=0).max():
+        return none, ()
+    still = np.abs(world[:, kept] - np.eye(3)).max(axis=(1, 2, 3)) < 0.01
+    still &= np.linalg.norm(place[:, kept[0]] - own[0], axis=-1) < GIVE
+    where = f"{rig.names[kept[0]]} stands {far:.2f} m to the side of the skeleton's origin"
+    if not still.any() or np.ptp(own[:, 2]) > np.ptp(own[:, 1]):
+        return none, (f"without a skin it rests as its nodes stand, where {where}; the path is told since there",)
+    return aside, (f"without a skin it rests as in its frame {int(still.argmax())}, where {where}; the path keeps that",)
 
 
 def carries_limb(names: Sequence[str], parents: np.ndarray) -> np.ndarray:
