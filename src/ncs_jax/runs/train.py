@@ -40,6 +40,7 @@ __all__ = ["Begun", "train", "train_assembly"]
 
 
 IDLE = 0.5  # mm that alpha should make a difference of, at least
+ALONG = 0.25  # of its swing that the cloth should go along with by the end
 
 
 def train(
@@ -269,7 +270,7 @@ class _Loop:
         self._every, self._check = whole_chunks(spec.checkpoint_every), whole_chunks(spec.validate_every)
         self._first, self._dropped = int(state.step), int(state.dropped)
         # One look alone may see nothing but frames that stand still: these are all looks since the last validation.
-        self._moved: deque[float] = deque(maxlen=self._check // CHUNK)
+        self._moved: deque[tuple[float, float]] = deque(maxlen=self._check // CHUNK)  # and swung
         self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
 
     def run(self, trained: TrainedMotion, timed: Minutes | None = None) -> Run:
@@ -324,7 +325,7 @@ class _Loop:
         """Return the report of a chunk: it is measured, and validated where that is due."""
         assembly, seen = self._placed.assembly, self._placed.measure(state.params, done)
         due = done % self._check == 0 or done == self._steps
-        message = self._message(state, seen.get("moved"), due)
+        message = self._message(state, seen, due, done)
         validation = _validate(Run(assembly, state.params)) if due and assembly.scene.motion.validation else None
         return Report(
             step=done,
@@ -341,16 +342,20 @@ class _Loop:
             moved=seen.get("moved"),
         )
 
-    def _message(self, state: TrainState, moved: float | None, due: bool) -> str:
-        """Return why a step of the chunk was dropped, or that alpha does nothing, or "" where all is well."""
-        if moved is not None:
-            self._moved.append(moved)
+    def _message(self, state: TrainState, seen: dict[str, float], due: bool, done: int) -> str:
+        """Return why a step of the chunk was dropped, or that alpha does nothing, or little, or "" where all is well."""
+        if "moved" in seen:
+            self._moved.append((seen["moved"], seen.get("swung", 0.0)))
         if int(state.dropped) > self._dropped:
             self._dropped = int(state.dropped)
             return "step dropped: " + self._placed.diagnose(state)
-        if due and self._moved and (mean := sum(self._moved) / len(self._moved)) < IDLE:
-            return f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {mean:.2g} mm"
-        return ""
+        if not due or not self._moved:
+            return ""
+        moved, swung = np.mean(self._moved, axis=0)
+        if done == self._steps and self._settle is None and moved < ALONG * swung:
+            share = f"{100 * moved / swung:.0f} % of its swing, {moved:.2g} of {swung:.2g} mm"
+            return f"the cloth goes along with {share}: alpha does little until it is trained longer"
+        return f"the dynamic branch is idle: alpha = 0 and alpha = 1 differ by {moved:.2g} mm" if moved < IDLE else ""
 
     def _pace(self, done: int) -> float:
         """Return the seconds of a step since the first chunk, 0 after that chunk."""

@@ -29,7 +29,8 @@ def training_metrics(
 ) -> dict[str, Float[Array, ""]]:
     """Return mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
 
-    Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm.
+    Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm. With a
+    swing also `swung`: how far that is by itself.
     """
     codes = network.windows(params, track, ends, window, 1)
     z, q = codes.together(), codes.swung()
@@ -52,6 +53,10 @@ def training_metrics(
     if codes.dynamic is not None:
         moved = offsets - decode(network, params, model, codes.static[-1])
         found["moved"] = 1000 * jnp.mean(norm(jnp.moveaxis(moved, 1, -1)))
+    if q is not None:
+        directions = required(model.vibrations, "model.vibrations").directions
+        free = jnp.tensordot(directions, q[-1], (-1, -1), precision="highest")
+        found["swung"] = 1000 * jnp.mean(norm(jnp.moveaxis(free, 1, -1)))
     return found
 
 
