@@ -107,6 +107,23 @@ def test_a_garment_of_no_size_is_refused(body):
 
 
 @pytest.mark.parametrize(
+    ("unit", "given", "mend"),
+    [
+        (0.0254, 2.54, "2.54 centimetres is --scale 0.0254$"),
+        (0.0254, 25.4, "25.4 millimetres is --scale 0.0254$"),
+        (0.01, 100, "100 units to a metre is --scale 0.01$"),
+        (0.01, 7, "--scale 0.01 for centimetres, --scale 0.0254 for inches$"),
+        (1e-7, 1.0, "leave it out, so that it is found$"),
+    ],
+)
+def test_a_unit_that_is_not_in_metres_is_told_in_metres(body, unit, given, mend):
+    shirt = io.GarmentRecord(sleeve().vertices / unit, sleeve().faces)
+    words = rf"g\.obj: scale: a unit in which .*in metres \(found '{given:g}, .* m'\); .*"
+    with pytest.raises(InputError, match=words + mend.replace("--scale", "scale")):
+        place("g.obj", shirt, body, scale=given)
+
+
+@pytest.mark.parametrize(
     ("scale", "up", "offset"),
     [
         (1.0, "y", (0.0, -0.21, -0.03)),
