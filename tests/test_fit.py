@@ -106,6 +106,14 @@ def test_a_garment_of_no_size_is_refused(body):
         place("g.obj", io.GarmentRecord(1e7 * sleeve().vertices, sleeve().faces), body)
 
 
+@pytest.mark.parametrize(("option", "what"), [("--clearance", "6.0"), ("--weld", "0.2"), ("--clearance", "600.0")])
+def test_a_length_that_cannot_be_in_metres_is_told_in_metres(capsys, tmp_path, option, what):
+    assert main(["fit", "ncs:tshirt", "--out", str(tmp_path / "a.npz"), option, what]) == 2
+    metres = "" if what == "600.0" else f": {float(what):g} mm is {option} {float(what) / 1000:g}"
+    line = f"ncs: {option}: metres, 0.1 at most, expected (found {what}); metres are meant{metres}\n"
+    assert capsys.readouterr().err == line and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("unit", "given", "mend"),
     [

@@ -70,10 +70,12 @@ def fit(options) -> int:
     for name in filter(None, (options.garment, options.body, options.source)):
         arguments.check_file(name)
     from ncs_jax import io
-    from ncs_jax.prepare.fit import settle
+    from ncs_jax.prepare.fit import check_length, settle
     from ncs_jax.prepare.garment_placement import place
     from ncs_jax.prepare.skinning_weights import with_body_weights
 
+    for name in ("clearance", "weld"):
+        check_length(f"--{name}", getattr(options, name))
     out, scene = Path(options.out), Scene()
     if out.suffix.lower() != ".npz":
         raise InputError(
