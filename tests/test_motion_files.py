@@ -315,6 +315,10 @@ def test_a_table_sets_scale_up_and_joints_of_one_file_alone(tmp_path):
 WRONG = {
     "letters": (["ncs:walk[a:b]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write ncs:walk\[10:300\]"),
     "steps": (["ncs:walk[1:9:2]"], {}, r"motion.files\[0\]: frames as \[START:STOP\]"),
+    "a dash": (["walk.bvh[1-40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write walk.bvh\[1:40\]"),
+    "a comma": (["ncs:walk[1, 40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write ncs:walk\[1:40\]"),
+    "words": (["a/*.BVH[1 to 40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write a/\*.BVH\[1:40\]"),
+    "one number": (["w.glb#Run [7]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write w.glb#Run\[7:\]"),
     "three": ([{"file": "a.bvh", "frames": [1, 2, 3]}], {}, r"motion.files\[0\].frames: one or two numbers"),
     "below": (["ncs:walk", {"file": "a.bvh", "frames": [-1]}], {}, r"motion.files\[1\].frames\[0\]: a number from 0"),
     "scale": ([{"file": "a.bvh", "scale": "cm"}], {}, r"motion.files\[0\].scale: a number expected.*found 'cm'"),
