@@ -547,6 +547,13 @@ def test_a_body_in_a_format_without_one_is_refused_before_the_run_is_read(run_fo
     one_line(capsys, [".glb expected", name])
 
 
+@pytest.mark.parametrize(("command", "video"), [("animate", ".glb, .mp4, or a folder"), ("simulate", ".glb, or a folder")])
+def test_an_unknown_suffix_is_told_all_that_the_command_writes(run_folder, tmp_path, capsys, command, video):
+    target = str(run_folder[command == "animate"])
+    assert main([command, target, "--out", str(tmp_path / "a.abc")]) == 2
+    one_line(capsys, ["a.abc: one of .npz, .h5, .hdf5, .pc2, .mdd, ", video, "found '.abc'"])
+
+
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])
 def test_animate_in_every_format(run_folder, tmp_path, capsys, name):
     _, folder = run_folder

@@ -91,7 +91,8 @@ def animate(options) -> int:
     from ncs_jax import io
     from ncs_jax.io.animation.animation import animation_suffix
 
-    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body)  # before the run is read
+    # before the run is read
+    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body, also=(".mp4",))
     run, motion = _run_and_motion(options)
     worn_by = None
     if options.body:

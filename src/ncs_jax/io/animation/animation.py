@@ -81,8 +81,10 @@ def write_animation(
         _write_folder(file, x, obj_faces(triangles, maps), float(fps))
 
 
-def animation_suffix(path: str | Path, *, with_body: bool = False) -> str:
+def animation_suffix(path: str | Path, *, with_body: bool = False, also: tuple[str, ...] = ()) -> str:
     """Return the suffix of a file that an animation, perhaps with a body, can be written to, or nothing for a folder.
+
+    `also` are suffixes that the caller writes by other means, for the error.
 
     Raises:
         InputError: no such format is written or it holds no body, a package for it is not there, or a folder stands where the
@@ -91,7 +93,8 @@ def animation_suffix(path: str | Path, *, with_body: bool = False) -> str:
     file = Path(path)
     suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
     if suffix and suffix not in FORMATS:
-        raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+        known = ", ".join((*FORMATS, *also))
+        raise InputError(f"one of {known}, or a folder, expected", file=file, value=suffix, mend="end the name so")
     if suffix and file.expanduser().is_dir():
         raise InputError("a file expected", file=file, value="a folder", mend="give another name")
     if with_body and suffix != ".glb":
