@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import tomllib
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from typing import Any
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_lists import each_motion
 from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
-from ncs_jax.scene.parsing import checked_value, parse_table
+from ncs_jax.scene.parsing import checked_value, parse_table, read_toml
 
 __all__ = [
     "PRESETS",
@@ -326,14 +325,7 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
         kind = "a folder" if file.is_dir() else f"a {file.suffix or 'file without suffix'}"
         mend = "of a garment, ncs fit writes one; of a run, ncs view and ncs evaluate read its folder"
         raise InputError("a scene file that ends in .toml expected", file=file, value=kind, mend=mend)
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such scene file", file=file, mend="check the path, or try ncs:tshirt") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", file=file, mend="correct that line") from None
+    tables = read_toml(file)
     if preset is not None and preset not in PRESETS:
         raise InputError(f"one of {', '.join(PRESETS)} expected", field="preset", value=preset)
     for table, values in PRESETS[preset].items() if preset else ():
