@@ -258,6 +258,30 @@ def test_wrong_options(capsys, arguments):
     assert "usage: ncs" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("animate a --out b --alpha 1,5", "--alpha: a finite number expected, found 1,5; write 1.5, with a point"),
+        ("animate a --out b --alpha much", "--alpha: a finite number expected, found much"),
+        ("animate a --out b --refine 4,0", "--refine: a whole number from 1 expected, found 4,0"),
+        ("animate a --out b --refine 4.5", "--refine: a whole number from 1 expected, found 4.5"),
+        (
+            "fit a --out b --scale 0,0254",
+            "--scale: a number of metres a unit above 0 expected, found 0,0254; write 0.0254, with",
+        ),
+        ("fit a --out b --clearance inf", "--clearance: a number of metres above 0 expected, found inf"),
+        ("fit a --out b --move 0 ,1 0", "--move: a finite number expected, found ,1; write .1, with a point"),
+        ("fit a --out b --turn 90,0", "--turn: a whole number from 0 expected, found 90,0"),
+        ("train a --out b --steps 5,000", "--steps: a whole number from 1 expected, found 5,000; write 5000, without commas"),
+        ("train a --out b --seed one", "--seed: a whole number from 0 to 2147483647 expected, found one"),
+    ],
+)
+def test_numbers_that_are_none_say_how_they_are_written(capsys, line, words):
+    with pytest.raises(SystemExit) as stop:
+        main(line.split())
+    assert stop.value.code == 2 and f"argument {words}" in capsys.readouterr().err
+
+
 def test_hosts_that_cannot_be_joined(capsys):
     line = ["train", "ncs:tshirt", "--out", "nowhere", "--hosts"]
     assert main([*line, "nowhere.invalid:1234,2,1"]) == 2

@@ -8,6 +8,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from ncs_jax.errors import InputError
@@ -53,16 +54,28 @@ def add_body(parser: argparse.ArgumentParser) -> None:
         "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
     )
     mesh = parser.add_argument_group("a body that is a mesh for each frame (folder of .obj, .npz, .h5, .pc2, .mdd, USD)")
-    mesh.add_argument("--body-scale", type=positive, default=0.0, metavar="M", help="metres a unit, 0.01 for cm (default: 1)")
+    mesh.add_argument(
+        "--body-scale",
+        type=partial(positive, of="metres a unit"),
+        default=0.0,
+        metavar="M",
+        help="metres a unit, 0.01 for cm (default: 1)",
+    )
     mesh.add_argument("--body-up", choices=("x", "y", "z"), default="", help="the axis that is up in it (default: y)")
-    mesh.add_argument("--body-fps", type=positive, default=0.0, metavar="N", help="frames per second, for the scene")
+    mesh.add_argument(
+        "--body-fps",
+        type=partial(positive, of="frames a second"),
+        default=0.0,
+        metavar="N",
+        help="frames per second, for the scene",
+    )
     mesh.add_argument("--body-mesh", default="", metavar="FILE", help="mesh with the faces of a .pc2 or .mdd")
 
 
 def add_adapting(parser: argparse.ArgumentParser) -> None:
     """Add the options with which a run is adapted to the motion first."""
     parser.add_argument(
-        "--adapt", type=positive, metavar="SECONDS",
+        "--adapt", type=partial(positive, of="seconds"), metavar="SECONDS",
         help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
     )  # fmt: skip
     parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
@@ -122,35 +135,39 @@ def mesh_names(scene) -> tuple[str, str]:
     return (garment, body) if garment != body else ("garment", "body")
 
 
-def positive(text: str) -> float:
-    """Return a number above 0."""
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"a number above 0 expected, found {text}")
-    return value
+def positive(text: str, of: str = "") -> float:
+    """Return a number above 0; `of` says what it counts, as seconds."""
+    return _number(text, f"a number {f'of {of} ' if of else ''}above 0", lambda value: 0 < value < math.inf)
 
 
-def whole(text: str) -> int:
-    """Return a whole number from 1."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"a whole number from 1 expected, found {text}")
-    return value
+def whole(text: str, least: int = 1) -> int:
+    """Return a whole number, at least 1."""
+    return int(_number(text, f"a whole number from {least}", lambda value: value >= least, int))
 
 
 def seed(text: str) -> int:
     """Return a seed, 0 to 2^31 - 1."""
-    value = int(text)
-    if not 0 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"a whole number from 0 to {2**31 - 1} expected, found {text}")
-    return value
+    return int(_number(text, f"a whole number from 0 to {2**31 - 1}", lambda value: 0 <= value < 2**31, int))
 
 
 def finite(text: str) -> float:
     """Return a finite number."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"a finite number expected, found {text}")
+    return _number(text, "a finite number", math.isfinite)
+
+
+def _number(text: str, expected: str, good: Callable[[float], bool], kind: type[float] | type[int] = float) -> float:
+    """Return the number that a text is, or say what is expected; of one with a comma, how it is written with a point."""
+    try:
+        value = kind(text)
+    except ValueError:
+        meant = ""
+        if re.fullmatch(r"-?\d{1,3}(,\d{3})+", text) and kind is int:
+            meant = f"; write {text.replace(',', '')}, without commas"
+        elif re.fullmatch(r"-?\d*,\d+", text) and kind is float:
+            meant = f"; write {text.replace(',', '.')}, with a point"
+        raise argparse.ArgumentTypeError(f"{expected} expected, found {text}{meant}") from None
+    if not good(value):
+        raise argparse.ArgumentTypeError(f"{expected} expected, found {text}")
     return value
 
 

@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,12 +41,20 @@ def add_commands(commands) -> None:
     parser.add_argument(
         "--out", required=True, metavar="FILE", help=".npz; beside it a picture, .png, and a scene, .toml, if there is none yet"
     )
-    parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found)")
+    parser.add_argument(
+        "--scale",
+        type=partial(arguments.positive, of="metres a unit"),
+        default=0.0,
+        help="metres a unit of the file (default: found)",
+    )
     parser.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="", help="the axis that is up in the file (default: found)"
     )
     parser.add_argument(
-        "--turn", type=int, choices=(0, 90, 180, 270), help="degrees to turn it about the vertical then (default: found)"
+        "--turn",
+        type=partial(arguments.whole, least=0),
+        choices=(0, 90, 180, 270),
+        help="degrees to turn it about the vertical then (default: found)",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--stay", action="store_true", help="do not move it, whatever speaks for another place")
@@ -56,10 +65,12 @@ def add_commands(commands) -> None:
         metavar=("X", "Y", "Z"),
         help="move it by this, metres along the body's axes, Y up, once unit and axes are found (default: found)",
     )
-    parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="merge vertices within M metres")
+    parser.add_argument(
+        "--weld", type=partial(arguments.positive, of="metres"), default=0.0, metavar="M", help="merge vertices within M metres"
+    )
     parser.add_argument(
         "--clearance",
-        type=arguments.positive,
+        type=partial(arguments.positive, of="metres"),
         metavar="M",
         help="distance to keep from the body, metres (default: found, so that no skin shows between vertices)",
     )
