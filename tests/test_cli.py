@@ -262,6 +262,8 @@ def test_wrong_options(capsys, arguments):
     ("line", "words"),
     [
         ("animate a --out b --alpha 1,5", "--alpha: a finite number expected, found 1,5; write 1.5, with a point"),
+        ("animate a --out b --adapt long", "--adapt: a number of seconds above 0 expected, found long"),
+        ("train a --out b --minutes 2m", "--minutes: a number of minutes above 0 expected, found 2m"),
         ("animate a --out b --alpha much", "--alpha: a finite number expected, found much"),
         ("animate a --out b --refine 4,0", "--refine: a whole number from 1 expected, found 4,0"),
         ("animate a --out b --refine 4.5", "--refine: a whole number from 1 expected, found 4.5"),

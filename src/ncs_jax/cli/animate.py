@@ -86,6 +86,7 @@ def add_commands(commands) -> None:
 def animate(options) -> int:
     """Animate a trained garment over a motion, and write it to a file."""
     arguments.check_run(options.folder)
+    arguments.check_adapted(options)
     import numpy as np
 
     from ncs_jax import io
@@ -172,9 +173,9 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
     from ncs_jax.cli.check import tell_beyond
     from ncs_jax.runs.run import load_run
 
-    if options.adapt is None and (len(options.motion) > 1 or options.adapted):
-        field, value = ("--adapted", options.adapted) if options.adapted else ("--motion", ", ".join(options.motion))
-        raise InputError("one motion expected without --adapt", field=field, value=value, mend="add --adapt 20")
+    if options.adapt is None and len(options.motion) > 1:
+        value = ", ".join(options.motion)
+        raise InputError("one motion expected without --adapt", field="--motion", value=value, mend="add --adapt 20")
     run = load_run(options.folder)
     motions = options.motion or list(run.assembly.scene.motions[:1])
     if not motions:

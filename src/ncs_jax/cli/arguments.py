@@ -20,6 +20,7 @@ __all__ = [
     "add_body",
     "body_of",
     "body_table",
+    "check_adapted",
     "check_file",
     "check_run",
     "command",
@@ -79,6 +80,14 @@ def add_adapting(parser: argparse.ArgumentParser) -> None:
         help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
     )  # fmt: skip
     parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
+
+
+def check_adapted(options) -> None:
+    """Raise an InputError where the folder of an adapted run is named, and nothing is to be adapted."""
+    if options.adapted and options.adapt is None:
+        there = (Path(options.adapted) / "run.json").exists()
+        mend = f"add --adapt 20, or give {options.adapted} as the RUN" if there else "add --adapt 20"
+        raise InputError("--adapt expected beside it", field="--adapted", value=options.adapted, mend=mend)
 
 
 def check_file(name: str) -> None:
