@@ -115,6 +115,28 @@ def test_a_length_that_cannot_be_in_metres_is_told_in_metres(capsys, tmp_path, o
 
 
 @pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--body", "body.glb", "--betas", "1", "2"], "body.glb: --betas: an SMPL model as .npz expected for this option"),
+        (["--betas", "1"], "body.npz: --betas: an SMPL model with shapedirs expected for this option"),
+        (["--body", "body.glb", "--part", "hair"], "body.glb: --part: no such mesh in the file (found 'hair')"),
+        (["--mesh", "Dres"], "two.obj: --mesh: no such mesh in the file (found 'Dres')"),
+        ([], "two.obj: --mesh: "),
+        (["--mesh", "Dress", "--weld", "0.1"], "two.obj: --weld: a tolerance smaller than every edge expected"),
+    ],
+)
+def test_what_an_option_says_is_named_by_the_option(capsys, tmp_path, monkeypatch, given, words):
+    """And not by the field of a scene that it stands for."""
+    monkeypatch.chdir(tmp_path)
+    io.write_body("body.glb", io.read_body(ASSETS / "body.npz"))
+    corners = "v 0 1 0\nv 0.02 1 0\nv 0 1.02 0\n"
+    (tmp_path / "two.obj").write_text(f"{corners}{corners}o Dress\nf 1 2 3\no Hat\nf 4 5 6\n")
+    assert main(["fit", "two.obj", "--out", "a.npz", *given]) == 2
+    error = capsys.readouterr().err
+    assert words in error and "body." not in error.replace("body.glb", "").replace("body.npz", "") and "garment." not in error
+
+
+@pytest.mark.parametrize(
     ("unit", "given", "mend"),
     [
         (0.0254, 2.54, "2.54 centimetres is --scale 0.0254$"),

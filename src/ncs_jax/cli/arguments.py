@@ -7,7 +7,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ __all__ = [
     "FORMATS",
     "add_adapting",
     "add_body",
+    "as_options",
     "body_of",
     "body_table",
     "check_adapted",
@@ -36,6 +38,11 @@ BLENDER = (
     "  in Blender's Mesh Cache: Forward Z, Up -Y (on an object that is turned by 90 degrees about X, as an .obj's import does: "
     "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
 )
+OPTIONS = {
+    **{f"body.{name}": f"--{name}" for name in ("part", "betas")},
+    **{f"body.{name}": f"--body-{name}" for name in ("scale", "up", "fps", "mesh")},
+    **{f"garment.{name}": f"--{name}" for name in ("mesh", "scale", "up", "weld")},
+}  # what stands for the field of a scene
 MOVING = ("scale", "up", "fps", "mesh")  # what a scene says of a body that is a mesh for each frame
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
@@ -102,8 +109,28 @@ def check_run(folder: str) -> None:
         raise InputError("no run there", file=Path(folder) / "run.json", mend="give a folder that ncs train made")
 
 
+@contextmanager
+def as_options() -> Iterator[None]:
+    """Name options in errors that name the fields of a scene which they stand for."""
+    try:
+        yield
+    except InputError as error:
+        if error.field not in OPTIONS:
+            raise
+        mend = re.sub(r"\b(?:body|garment)\.\w+", lambda found: OPTIONS.get(found[0], found[0]), error.mend or "")
+        if "body.shapes" in mend:  # which no option gives
+            mend = "leave it out: the file alone says what shape it has"
+        expected = error.expected.replace("this field", "this option")
+        raise InputError(expected, file=error.file, field=OPTIONS[error.field], value=error.value, mend=mend) from None
+
+
 def body_of(options):
     """Return the body that the options of `add_body` mean."""
+    with as_options():
+        return _body_of(options)
+
+
+def _body_of(options):
     from ncs_jax import io
 
     own = {name: getattr(options, f"body_{name}") for name in MOVING}

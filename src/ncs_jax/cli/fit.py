@@ -94,7 +94,8 @@ def fit(options) -> int:
         )
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
-    given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
+    with arguments.as_options():
+        given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
     given = with_body_weights(given, source)
     known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
     move = (0.0, 0.0, 0.0) if options.stay else options.move
