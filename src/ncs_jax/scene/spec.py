@@ -122,6 +122,7 @@ class MotionSpec:
     broken: str = _f("refuse", "motions that cannot be used: refuse the scene; or skip them", choices=("refuse", "skip"))
     own: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})  # by motion, what its table says
     found: tuple[str, ...] = field(default=(), metadata={"internal": True})  # in words, what names of many motions stand for
+    lone: bool = field(default=False, metadata={"internal": True})  # one motion, which `joints` need not be meant for
 
 
 @dataclass(frozen=True)
@@ -282,7 +283,7 @@ class Scene:
         tables["body"] |= {name: absolute(tables["body"][name]) for name in ("file", "mesh")}
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
         tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
-        own, _ = tables["motion"].pop("own"), tables["motion"].pop("found")
+        own, _, _ = (tables["motion"].pop(name) for name in ("own", "found", "lone"))
         for key in LISTS:
             given = [(name, split_frames(name)[0]) for name in tables["motion"][key]]
             tables["motion"][key] = [
