@@ -245,6 +245,24 @@ def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, words):
     one_line(capsys, words)
 
 
+@pytest.mark.parametrize("command", ["check", "train --out r", "demo --out r --scene"])
+def test_a_character_without_a_motion_is_refused(tmp_path, capsys, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    edited(scene := write_scene(tmp_path), 'files = ["swing.npz"]', "files = []")
+    assert main([*command.split(), str(scene)]) == 2
+    one_line(capsys, ["scene.toml: motion.files: a motion to train on expected (found [])", "ncs:walk"])
+    assert not (tmp_path / "r").exists()
+
+
+def test_cloth_without_a_character_needs_no_motion(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    edited(scene := write_scene(tmp_path), 'files = ["swing.npz"]\nvalidation = ["swing.npz"]', "files = []")
+    edited(scene, 'file = "body.npz"', 'file = "none"')
+    edited(scene, "smoothing = 2", 'pins = "pins"')
+    assert main(["check", str(scene)]) == 0
+    assert "the character never moves" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "arguments",
     ["", "fly", "train ncs:tshirt", "train a --out b --steps 0", "train a --out b --seed=-1", "animate a --out b --alpha nan",

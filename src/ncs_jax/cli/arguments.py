@@ -24,6 +24,7 @@ __all__ = [
     "body_table",
     "check_adapted",
     "check_file",
+    "check_motions",
     "check_run",
     "command",
     "finite",
@@ -87,6 +88,13 @@ def add_adapting(parser: argparse.ArgumentParser) -> None:
         help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
     )  # fmt: skip
     parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
+
+
+def check_motions(scene) -> None:
+    """Raise an InputError where a scene has a character and no motion to train on: nothing that moves would be learned."""
+    if not scene.motion.files and scene.body.file not in ("", "none") and not scene.moves_by_itself:
+        mend = 'name one, as "walk.fbx" or "ncs:walk"; ncs simulate --motion takes one besides'
+        raise InputError("a motion to train on expected", file=scene.source, field="motion.files", value=[], mend=mend)
 
 
 def check_adapted(options) -> None:

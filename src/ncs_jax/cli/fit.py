@@ -127,7 +127,8 @@ def fit(options) -> int:
         use, after = "train", f"ncs train {name} --out {run} --preview"
         if body.frames is not None:
             use, after = "simulate", f"ncs simulate {name} --out {shlex.quote(out.stem)}.glb --body"
-        print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: ncs check {name}, then {after}")
+        first = "name its motions there, then " if "files = []" in text else ""
+        print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: {first}ncs check {name}, then {after}")
     return 0
 
 

@@ -70,6 +70,7 @@ def train(options) -> int:
     if options.video:
         check_video(options.out)
     scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
+    arguments.check_motions(scene)
 
     import jax
 
@@ -100,7 +101,9 @@ def demo(options) -> int:
     out = Path(options.out)
     resume = (out / "run.json").exists()
     minutes = options.minutes if options.minutes or resume else DEMO_MINUTES
-    run = _trained(load_scene(options.scene), out, minutes=minutes, resume=resume)
+    scene = load_scene(options.scene)
+    arguments.check_motions(scene)
+    run = _trained(scene, out, minutes=minutes, resume=resume)
     draw(run, out)
     _warn_of_few_steps(run, None, f"ncs demo --out {shlex.quote(str(out))} --minutes M goes on")
     return 0

@@ -103,7 +103,8 @@ class MotionSpec:
     """[motion]: what the character does."""
 
     files: tuple[str, ...] = _f(
-        ("ncs:walk",), "motions to train on: FILE, FILE[10:300], FOLDER, *.bvh, LIST.txt; empty: the character stands still"
+        ("ncs:walk",),
+        "motions to train on: FILE, FILE[10:300], FOLDER, *.bvh, LIST.txt; empty: none, for cloth without a character",
     )
     validation: tuple[str, ...] = _f((), "motions to validate on, not to train on")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
