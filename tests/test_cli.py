@@ -591,6 +591,28 @@ def test_a_body_in_a_format_without_one_is_refused_before_the_run_is_read(run_fo
     one_line(capsys, [".glb expected", name])
 
 
+PLACES = {  # below a file, whoever tries; or what is there already
+    "animate": "file/a.npz", "animate --adapt 20": "file/b/a.glb", "animate --adapted c --adapt 20": "full", "simulate": "full",
+    "simulate --body": "taken.glb", "export": "file/a.onnx", "export --format web": "file/a.html", "preview": "file/b",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", PLACES)
+def test_a_place_that_cannot_be_written_is_refused_before_any_work(run_folder, tmp_path, capsys, monkeypatch, line):
+    monkeypatch.setattr("ncs_jax.runs.run.load_run", None)
+    monkeypatch.setattr("ncs_jax.runs.simulate.simulate", None)
+    (tmp_path / "file").write_text("in the way")
+    for name in ("full", "taken.glb"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("dear")
+    command, *options = line.split()
+    target, before = str(run_folder[command != "simulate"]), sorted(tmp_path.rglob("*"))
+    assert main([command, target, *options, "--out", str(tmp_path / PLACES[line])]) == 2
+    words = {"full": "an empty or new folder expected (found 'letter.txt')", "taken.glb": "a file expected (found 'a folder')"}
+    one_line(capsys, [words.get(PLACES[line], f"{tmp_path / 'file'} is not a folder")])
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 @pytest.mark.parametrize(("command", "video"), [("animate", ".glb, .mp4, or a folder"), ("simulate", ".glb, or a folder")])
 def test_an_unknown_suffix_is_told_all_that_the_command_writes(run_folder, tmp_path, capsys, command, video):
     target = str(run_folder[command == "animate"])

@@ -211,11 +211,12 @@ def export(options) -> int:
     """Write one step of a trained garment as a file, and print how it was checked."""
     arguments.check_run(options.folder)
     from ncs_jax.export.facts import FileFormat
+    from ncs_jax.io.tables.files import check_place
     from ncs_jax.runs.run import load_run
 
     if options.format == "web":
         return _export_page(options)
-    FileFormat(options.format).check_name(Path(options.out))  # before the run is read
+    FileFormat(options.format).check_name(check_place(options.out))  # before the run is read
     for field in ("runtime", "refine"):
         if getattr(options, field) is not None:
             raise InputError("--format web expected", field=f"--{field}", value=getattr(options, field), mend="leave it out")
@@ -229,11 +230,12 @@ def export(options) -> int:
 def _export_page(options) -> int:
     """Write the page in which a browser runs a garment, and print how it was checked."""
     from ncs_jax.cli.check import tell_beyond
+    from ncs_jax.io.tables.files import check_place
     from ncs_jax.runs.run import load_run
     from ncs_jax.view.browser_runtime import read_runtime
     from ncs_jax.view.living import check_name, write_living_page
 
-    check_name(Path(options.out))
+    check_name(check_place(options.out))
     if options.opset != 15:
         raise InputError("15 expected for web", field="--opset", value=options.opset, mend="leave it out")
     runtime = read_runtime(options.runtime)

@@ -81,6 +81,7 @@ def fit(options) -> int:
     for name in filter(None, (options.garment, options.body, options.source)):
         arguments.check_file(name)
     from ncs_jax import io
+    from ncs_jax.io.tables.files import check_place
     from ncs_jax.prepare.fit import check_length, settle
     from ncs_jax.prepare.garment_placement import place
     from ncs_jax.prepare.skinning_weights import with_body_weights
@@ -92,6 +93,8 @@ def fit(options) -> int:
         raise InputError(
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
         )
+    if check_place(out).is_dir():
+        raise InputError("a file expected", field="--out", value=options.out, mend="give another name")
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
     with arguments.as_options():
