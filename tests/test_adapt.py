@@ -136,7 +136,8 @@ def test_animate_adapts_first(trained, tmp_path, capsys, monkeypatch):
     line = ["animate", "run", "--out", "a.npz"]
     for wrong, words in (
         (["--motion", "clip.npz", "--motion", "swing.npz"], "--motion: one motion expected without --adapt"),
-        (["--adapted", "b"], "--adapted: one motion expected without --adapt"),
+        (["--adapted", "b"], "--adapted: --adapt expected beside it (found 'b'); add --adapt 20\n"),
+        (["--adapted", "run"], "--adapted: --adapt expected beside it (found 'run'); add --adapt 20, or give run as the RUN\n"),
     ):
         assert main([*line, *wrong]) == 2 and words in capsys.readouterr().err
     assert main([*line, "--motion", "clip.npz", "--adapt", str(MOMENT)]) == 0
@@ -146,5 +147,7 @@ def test_animate_adapts_first(trained, tmp_path, capsys, monkeypatch):
     assert main([*line, "--motion", "clip.npz", "--adapt", str(MOMENT)]) == 0
     assert "nothing was trained" in capsys.readouterr().out
     assert main(["view", "run", "--adapt", "1"]) == 2
-    assert "--motion and --adapt expected together" in capsys.readouterr().err
+    assert "--motion: a motion expected beside --adapt; add --motion FILE" in capsys.readouterr().err
+    assert main(["view", "run", "--adapted", "b"]) == 2
+    assert "--adapted: --adapt expected beside it" in capsys.readouterr().err
     assert Path("run_adapted_clip").is_dir()

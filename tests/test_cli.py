@@ -245,6 +245,24 @@ def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, words):
     one_line(capsys, words)
 
 
+@pytest.mark.parametrize("command", ["check", "train --out r", "demo --out r --scene"])
+def test_a_character_without_a_motion_is_refused(tmp_path, capsys, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    edited(scene := write_scene(tmp_path), 'files = ["swing.npz"]', "files = []")
+    assert main([*command.split(), str(scene)]) == 2
+    one_line(capsys, ["scene.toml: motion.files: a motion to train on expected (found [])", "ncs:walk"])
+    assert not (tmp_path / "r").exists()
+
+
+def test_cloth_without_a_character_needs_no_motion(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    edited(scene := write_scene(tmp_path), 'files = ["swing.npz"]\nvalidation = ["swing.npz"]', "files = []")
+    edited(scene, 'file = "body.npz"', 'file = "none"')
+    edited(scene, "smoothing = 2", 'pins = "pins"')
+    assert main(["check", str(scene)]) == 0
+    assert "the character never moves" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "arguments",
     ["", "fly", "train ncs:tshirt", "train a --out b --steps 0", "train a --out b --seed=-1", "animate a --out b --alpha nan",
@@ -256,6 +274,32 @@ def test_wrong_options(capsys, arguments):
         main(arguments.split())
     assert stop.value.code == 2
     assert "usage: ncs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("animate a --out b --alpha 1,5", "--alpha: a finite number expected, found 1,5; write 1.5, with a point"),
+        ("animate a --out b --adapt long", "--adapt: a number of seconds above 0 expected, found long"),
+        ("train a --out b --minutes 2m", "--minutes: a number of minutes above 0 expected, found 2m"),
+        ("animate a --out b --alpha much", "--alpha: a finite number expected, found much"),
+        ("animate a --out b --refine 4,0", "--refine: a whole number from 1 expected, found 4,0"),
+        ("animate a --out b --refine 4.5", "--refine: a whole number from 1 expected, found 4.5"),
+        (
+            "fit a --out b --scale 0,0254",
+            "--scale: a number of metres a unit above 0 expected, found 0,0254; write 0.0254, with",
+        ),
+        ("fit a --out b --clearance inf", "--clearance: a number of metres above 0 expected, found inf"),
+        ("fit a --out b --move 0 ,1 0", "--move: a finite number expected, found ,1; write .1, with a point"),
+        ("fit a --out b --turn 90,0", "--turn: a whole number from 0 expected, found 90,0"),
+        ("train a --out b --steps 5,000", "--steps: a whole number from 1 expected, found 5,000; write 5000, without commas"),
+        ("train a --out b --seed one", "--seed: a whole number from 0 to 2147483647 expected, found one"),
+    ],
+)
+def test_numbers_that_are_none_say_how_they_are_written(capsys, line, words):
+    with pytest.raises(SystemExit) as stop:
+        main(line.split())
+    assert stop.value.code == 2 and f"argument {words}" in capsys.readouterr().err
 
 
 def test_hosts_that_cannot_be_joined(capsys):
@@ -545,6 +589,35 @@ def test_a_body_in_a_format_without_one_is_refused_before_the_run_is_read(run_fo
     monkeypatch.setattr("ncs_jax.runs.run.load_run", None)
     assert main(["animate", str(run_folder[1]), "--body", "--out", str(tmp_path / name)]) == 2
     one_line(capsys, [".glb expected", name])
+
+
+PLACES = {  # below a file, whoever tries; or what is there already
+    "animate": "file/a.npz", "animate --adapt 20": "file/b/a.glb", "animate --adapted c --adapt 20": "full", "simulate": "full",
+    "simulate --body": "taken.glb", "export": "file/a.onnx", "export --format web": "file/a.html", "preview": "file/b",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", PLACES)
+def test_a_place_that_cannot_be_written_is_refused_before_any_work(run_folder, tmp_path, capsys, monkeypatch, line):
+    monkeypatch.setattr("ncs_jax.runs.run.load_run", None)
+    monkeypatch.setattr("ncs_jax.runs.simulate.simulate", None)
+    (tmp_path / "file").write_text("in the way")
+    for name in ("full", "taken.glb"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("dear")
+    command, *options = line.split()
+    target, before = str(run_folder[command != "simulate"]), sorted(tmp_path.rglob("*"))
+    assert main([command, target, *options, "--out", str(tmp_path / PLACES[line])]) == 2
+    words = {"full": "an empty or new folder expected (found 'letter.txt')", "taken.glb": "a file expected (found 'a folder')"}
+    one_line(capsys, [words.get(PLACES[line], f"{tmp_path / 'file'} is not a folder")])
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("command", "video"), [("animate", ".glb, .mp4, or a folder"), ("simulate", ".glb, or a folder")])
+def test_an_unknown_suffix_is_told_all_that_the_command_writes(run_folder, tmp_path, capsys, command, video):
+    target = str(run_folder[command == "animate"])
+    assert main([command, target, "--out", str(tmp_path / "a.abc")]) == 2
+    one_line(capsys, ["a.abc: one of .npz, .h5, .hdf5, .pc2, .mdd, ", video, "found '.abc'"])
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])

@@ -106,6 +106,53 @@ def test_a_garment_of_no_size_is_refused(body):
         place("g.obj", io.GarmentRecord(1e7 * sleeve().vertices, sleeve().faces), body)
 
 
+@pytest.mark.parametrize(("option", "what"), [("--clearance", "6.0"), ("--weld", "0.2"), ("--clearance", "600.0")])
+def test_a_length_that_cannot_be_in_metres_is_told_in_metres(capsys, tmp_path, option, what):
+    assert main(["fit", "ncs:tshirt", "--out", str(tmp_path / "a.npz"), option, what]) == 2
+    metres = "" if what == "600.0" else f": {float(what):g} mm is {option} {float(what) / 1000:g}"
+    line = f"ncs: {option}: metres, 0.1 at most, expected (found {what}); metres are meant{metres}\n"
+    assert capsys.readouterr().err == line and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--body", "body.glb", "--betas", "1", "2"], "body.glb: --betas: an SMPL model as .npz expected for this option"),
+        (["--betas", "1"], "body.npz: --betas: an SMPL model with shapedirs expected for this option"),
+        (["--body", "body.glb", "--part", "hair"], "body.glb: --part: no such mesh in the file (found 'hair')"),
+        (["--mesh", "Dres"], "two.obj: --mesh: no such mesh in the file (found 'Dres')"),
+        ([], "two.obj: --mesh: "),
+        (["--mesh", "Dress", "--weld", "0.1"], "two.obj: --weld: a tolerance smaller than every edge expected"),
+    ],
+)
+def test_what_an_option_says_is_named_by_the_option(capsys, tmp_path, monkeypatch, given, words):
+    """And not by the field of a scene that it stands for."""
+    monkeypatch.chdir(tmp_path)
+    io.write_body("body.glb", io.read_body(ASSETS / "body.npz"))
+    corners = "v 0 1 0\nv 0.02 1 0\nv 0 1.02 0\n"
+    (tmp_path / "two.obj").write_text(f"{corners}{corners}o Dress\nf 1 2 3\no Hat\nf 4 5 6\n")
+    assert main(["fit", "two.obj", "--out", "a.npz", *given]) == 2
+    error = capsys.readouterr().err
+    assert words in error and "body." not in error.replace("body.glb", "").replace("body.npz", "") and "garment." not in error
+
+
+@pytest.mark.parametrize(
+    ("unit", "given", "mend"),
+    [
+        (0.0254, 2.54, "2.54 centimetres is --scale 0.0254$"),
+        (0.0254, 25.4, "25.4 millimetres is --scale 0.0254$"),
+        (0.01, 100, "100 units to a metre is --scale 0.01$"),
+        (0.01, 7, "--scale 0.01 for centimetres, --scale 0.0254 for inches$"),
+        (1e-7, 1.0, "leave it out, so that it is found$"),
+    ],
+)
+def test_a_unit_that_is_not_in_metres_is_told_in_metres(body, unit, given, mend):
+    shirt = io.GarmentRecord(sleeve().vertices / unit, sleeve().faces)
+    words = rf"g\.obj: scale: a unit in which .*in metres \(found '{given:g}, .* m'\); .*"
+    with pytest.raises(InputError, match=words + mend.replace("--scale", "scale")):
+        place("g.obj", shirt, body, scale=given)
+
+
 @pytest.mark.parametrize(
     ("scale", "up", "offset"),
     [

@@ -13,6 +13,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.character.smpl import smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
+from ncs_jax.prepare.scene_checks import _cut_short
 from ncs_jax.scene.spec import scene_from
 
 HIERARCHY = """\
@@ -107,6 +108,18 @@ def test_frames_that_the_header_does_not_count_are_told(tmp_path, case):
     np.testing.assert_array_equal(found.poses, read(tmp_path, PLAIN).poses[:frames])
     assert len(found.notes) == 1
     assert re.search(note, found.notes[0]), found.notes
+
+
+@pytest.mark.parametrize("case", HEADS)
+def test_a_file_that_is_cut_short_is_at_risk(tmp_path, case):
+    head, data, frames, _ = HEADS[case]
+    found = read(tmp_path, bvh(f"{head}\nFrame Time: 0.033333\n", data))
+    risks = list(_cut_short(found, "a.bvh", ()))
+    assert [risk.value for risk in risks] == {
+        "cut short": ["8 of the 800 frames that its header says are there, in a.bvh"],
+        "half a frame": ["7 of the 8 frames that its header says are there, in a.bvh"],
+    }.get(case, [])
+    assert not list(_cut_short(found, "a.bvh", (0, frames)))
 
 
 @pytest.mark.parametrize(
@@ -315,6 +328,10 @@ def test_a_table_sets_scale_up_and_joints_of_one_file_alone(tmp_path):
 WRONG = {
     "letters": (["ncs:walk[a:b]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write ncs:walk\[10:300\]"),
     "steps": (["ncs:walk[1:9:2]"], {}, r"motion.files\[0\]: frames as \[START:STOP\]"),
+    "a dash": (["walk.bvh[1-40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write walk.bvh\[1:40\]"),
+    "a comma": (["ncs:walk[1, 40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write ncs:walk\[1:40\]"),
+    "words": (["a/*.BVH[1 to 40]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write a/\*.BVH\[1:40\]"),
+    "one number": (["w.glb#Run [7]"], {}, r"motion.files\[0\]: frames as \[START:STOP\].*write w.glb#Run\[7:\]"),
     "three": ([{"file": "a.bvh", "frames": [1, 2, 3]}], {}, r"motion.files\[0\].frames: one or two numbers"),
     "below": (["ncs:walk", {"file": "a.bvh", "frames": [-1]}], {}, r"motion.files\[1\].frames\[0\]: a number from 0"),
     "scale": ([{"file": "a.bvh", "scale": "cm"}], {}, r"motion.files\[0\].scale: a number expected.*found 'cm'"),

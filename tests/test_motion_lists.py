@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ncs_jax import io
 from ncs_jax.errors import InputError, InputWarning
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motions
 from ncs_jax.scene.spec import load_scene, scene_from
 
@@ -131,3 +134,39 @@ def test_one_broken_motion_is_that_error_and_none_left_to_train_on_is_refused(fo
         warnings.simplefilter("error")
         load_motions(given, None, lambda _: None)
     assert str(error.value.file).endswith("dance.bvh")
+
+
+def joints_said(files, joints=None, **motion):
+    return scene_from({"motion": {"files": files, "joints": joints or {}} | motion}, "scene.toml")
+
+
+@pytest.mark.parametrize(
+    ("files", "joints", "mend"),
+    [
+        (["ncs:walk", "ncs:jump"], {"LeftLegg": "LeftLeg"}, 'did you mean "LeftLeg" = "LeftLeg"?'),
+        (["ncs:walk"], {"mixamorig:leftleg": ""}, 'did you mean "LeftLeg" = ""?'),
+        (["ncs:walk"], {"Q": "LeftLeg"}, "leave it out, or write a joint of the motion first"),
+        ([{"file": "ncs:walk", "joints": {"Hipps": "Hips"}}, "ncs:jump"], {}, 'did you mean "Hips" = "Hips"?'),
+    ],
+)
+def test_a_mistyped_joint_is_refused_with_the_nearest_name(files, joints, mend):
+    name = next(iter(joints or files[0]["joints"]))
+    with pytest.raises(InputError) as error:
+        load_motions(joints_said(files, joints), io.read_body(packaged("body")), lambda _: None)
+    assert str(error.value) == (
+        f"scene.toml: motion.joints: a joint of the motions expected, and none has it (found {name!r}); {mend}"
+    )
+
+
+def test_joints_of_other_motions_of_the_scene_are_no_fault(tmp_path):
+    """One of several skeletons has the joint; or one motion is taken by itself, as a simulation does."""
+    body = io.read_body(packaged("body"))
+    walk = io.read_motion("ncs:walk")
+    names = ["Hip" if n == "Hips" else n for n in walk.joint_names]
+    given = {"poses": walk.poses, "trans": walk.translation, "fps": 30.0, "joint_names": names}
+    np.savez(tmp_path / "own.npz", **given, joints=body.joints, parents=body.parents)
+    said = joints_said([str(tmp_path / "own.npz"), "ncs:walk"], {"Hip": "Hips"})
+    _, motions = load_motions(said, body, lambda _: None)
+    assert [record.absent for record in motions.values()] == [{}, {"Hip": "Hips"}]
+    alone = replace(said, motion=replace(said.motion, files=("ncs:walk",), lone=True))
+    assert list(load_motions(alone, body, lambda _: None)[1]) == ["ncs:walk"]

@@ -28,7 +28,7 @@ from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.devices import free_memory
 from ncs_jax.training.step import initial_state
 
-from .scenes import FREE, grid, swing, write_scene
+from .scenes import FREE, grid, post, swing, write_scene
 
 STEPS = 60
 SOURCE = Path(__file__).parents[1] / "src"
@@ -340,11 +340,29 @@ def test_joints_that_turn_and_are_not_read_are_warned_of(tmp_path, plain_jax):
     ("old", "new", "match"),
     [
         ("decoder = [16]", "decoder = [32]", r"network.decoder: the network of .*first expected, \(16,\) .*decoder = \[16\]"),
-        ('file = "cloth.npz"', 'file = "other.npz"', "garment.file: the triangles of the garment of .*first expected, 40"),
+        (
+            'file = "cloth.npz"',
+            'file = "other.npz"',
+            r"garment.file: the garment of .*first expected, .*cloth.npz with 40 triangles, .*found 'other.npz, 32 triangles'",
+        ),
+        (
+            'file = "body.npz"',
+            'file = "one.npz"',
+            r"body.file: the body of .*first expected, .*body.npz, whose .*found 'one.npz, without joint 1'",
+        ),
+        (
+            'file = "body.npz"',
+            'file = "none"',
+            r"body.file: the body of .*first expected, .*found 'none, without joint 0 and 1 more'",
+        ),
     ],
 )
-def test_weights_of_another_network_or_garment_are_refused(unstarted, tmp_path, plain_jax, old, new, match):
+def test_weights_of_another_network_garment_or_body_are_refused(unstarted, tmp_path, plain_jax, monkeypatch, old, new, match):
+    """In words of the scene, and before a garment is made ready, which may take a minute."""
+    monkeypatch.setattr("ncs_jax.runs.train.assemble", pytest.fail)
     scene = write_scene(tmp_path, FREE.replace(old, new))
+    one = {name: a[:1] if name in ("joints", "parents") else a for name, a in post().items()}
+    np.savez(tmp_path / "one.npz", **one | {"blend_weights": np.ones((len(one["vertices"]), 1))})
     vertices, faces = grid(rows=5)
     np.savez(tmp_path / "other.npz", vertices=vertices, faces=faces)
     with pytest.raises(InputError, match=match):

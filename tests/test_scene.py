@@ -96,6 +96,32 @@ def test_one_error_names_file_field_value_and_mend(tmp_path, text, words):
         assert word in message
 
 
+WRITTEN = {
+    "an escape that TOML has not": (
+        r'file = "C:\Users\me\dress.obj"',
+        '"C:\\Users\\me\\dress.obj"; a backslash in double quotes begins a sign: write "C:/Users/me/dress.obj", or',
+    ),
+    "an escape that it has": (r'file = "C:\temp\new.obj"', "garment.file: a text without tabs"),
+    "in a list": (r'mesh = ["Dress", "a\b"]', "garment.mesh[1]: a text without tabs"),
+    "no quotes": ("file = dress.obj  # mine", 'text stands in quotes: file = "dress.obj"'),
+    "something else": ("file = [", "correct that line"),
+}
+
+
+@pytest.mark.parametrize("case", WRITTEN)
+def test_what_is_not_toml_shows_its_line_and_the_usual_mend(tmp_path, case):
+    line, words = WRITTEN[case]
+    with pytest.raises(InputError) as raised:
+        load_scene(write(tmp_path, f"[garment]\n{line}\n"))
+    assert words in str(raised.value) and "scene.toml" in str(raised.value)
+
+
+@pytest.mark.parametrize("line", [r"file = 'C:\Users\me\dress.obj'", r'file = "C:\\Users\\me\\dress.obj"'])
+def test_paths_of_windows_in_single_quotes_or_with_two_backslashes(tmp_path, line):
+    """Also where an editor puts its mark before the first line."""
+    assert load_scene(write(tmp_path, f"\ufeff[garment]\n{line}\n")).garment.file == r"C:\Users\me\dress.obj"
+
+
 def test_missing_files(tmp_path):
     with pytest.raises(InputError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")

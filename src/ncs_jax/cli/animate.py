@@ -86,12 +86,14 @@ def add_commands(commands) -> None:
 def animate(options) -> int:
     """Animate a trained garment over a motion, and write it to a file."""
     arguments.check_run(options.folder)
+    arguments.check_adapted(options)
     import numpy as np
 
     from ncs_jax import io
     from ncs_jax.io.animation.animation import animation_suffix
 
-    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body)  # before the run is read
+    # before the run is read
+    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body, also=(".mp4",))
     run, motion = _run_and_motion(options)
     worn_by = None
     if options.body:
@@ -171,9 +173,9 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
     from ncs_jax.cli.check import tell_beyond
     from ncs_jax.runs.run import load_run
 
-    if options.adapt is None and (len(options.motion) > 1 or options.adapted):
-        field, value = ("--adapted", options.adapted) if options.adapted else ("--motion", ", ".join(options.motion))
-        raise InputError("one motion expected without --adapt", field=field, value=value, mend="add --adapt 20")
+    if options.adapt is None and len(options.motion) > 1:
+        value = ", ".join(options.motion)
+        raise InputError("one motion expected without --adapt", field="--motion", value=value, mend="add --adapt 20")
     run = load_run(options.folder)
     motions = options.motion or list(run.assembly.scene.motions[:1])
     if not motions:
@@ -209,11 +211,12 @@ def export(options) -> int:
     """Write one step of a trained garment as a file, and print how it was checked."""
     arguments.check_run(options.folder)
     from ncs_jax.export.facts import FileFormat
+    from ncs_jax.io.tables.files import check_place
     from ncs_jax.runs.run import load_run
 
     if options.format == "web":
         return _export_page(options)
-    FileFormat(options.format).check_name(Path(options.out))  # before the run is read
+    FileFormat(options.format).check_name(check_place(options.out))  # before the run is read
     for field in ("runtime", "refine"):
         if getattr(options, field) is not None:
             raise InputError("--format web expected", field=f"--{field}", value=getattr(options, field), mend="leave it out")
@@ -227,11 +230,12 @@ def export(options) -> int:
 def _export_page(options) -> int:
     """Write the page in which a browser runs a garment, and print how it was checked."""
     from ncs_jax.cli.check import tell_beyond
+    from ncs_jax.io.tables.files import check_place
     from ncs_jax.runs.run import load_run
     from ncs_jax.view.browser_runtime import read_runtime
     from ncs_jax.view.living import check_name, write_living_page
 
-    check_name(Path(options.out))
+    check_name(check_place(options.out))
     if options.opset != 15:
         raise InputError("15 expected for web", field="--opset", value=options.opset, mend="leave it out")
     runtime = read_runtime(options.runtime)

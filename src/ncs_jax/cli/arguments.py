@@ -7,7 +7,9 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from ncs_jax.errors import InputError
@@ -17,9 +19,12 @@ __all__ = [
     "FORMATS",
     "add_adapting",
     "add_body",
+    "as_options",
     "body_of",
     "body_table",
+    "check_adapted",
     "check_file",
+    "check_motions",
     "check_run",
     "command",
     "finite",
@@ -34,6 +39,11 @@ BLENDER = (
     "  in Blender's Mesh Cache: Forward Z, Up -Y (on an object that is turned by 90 degrees about X, as an .obj's import does: "
     "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
 )
+OPTIONS = {
+    **{f"body.{name}": f"--{name}" for name in ("part", "betas")},
+    **{f"body.{name}": f"--body-{name}" for name in ("scale", "up", "fps", "mesh")},
+    **{f"garment.{name}": f"--{name}" for name in ("mesh", "scale", "up", "weld")},
+}  # what stands for the field of a scene
 MOVING = ("scale", "up", "fps", "mesh")  # what a scene says of a body that is a mesh for each frame
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
@@ -53,19 +63,46 @@ def add_body(parser: argparse.ArgumentParser) -> None:
         "--betas", nargs="+", type=finite, default=[], metavar="B", help="shape of an SMPL model (default: mean)"
     )
     mesh = parser.add_argument_group("a body that is a mesh for each frame (folder of .obj, .npz, .h5, .pc2, .mdd, USD)")
-    mesh.add_argument("--body-scale", type=positive, default=0.0, metavar="M", help="metres a unit, 0.01 for cm (default: 1)")
+    mesh.add_argument(
+        "--body-scale",
+        type=partial(positive, of="metres a unit"),
+        default=0.0,
+        metavar="M",
+        help="metres a unit, 0.01 for cm (default: 1)",
+    )
     mesh.add_argument("--body-up", choices=("x", "y", "z"), default="", help="the axis that is up in it (default: y)")
-    mesh.add_argument("--body-fps", type=positive, default=0.0, metavar="N", help="frames per second, for the scene")
+    mesh.add_argument(
+        "--body-fps",
+        type=partial(positive, of="frames a second"),
+        default=0.0,
+        metavar="N",
+        help="frames per second, for the scene",
+    )
     mesh.add_argument("--body-mesh", default="", metavar="FILE", help="mesh with the faces of a .pc2 or .mdd")
 
 
 def add_adapting(parser: argparse.ArgumentParser) -> None:
     """Add the options with which a run is adapted to the motion first."""
     parser.add_argument(
-        "--adapt", type=positive, metavar="SECONDS",
+        "--adapt", type=partial(positive, of="seconds"), metavar="SECONDS",
         help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
     )  # fmt: skip
     parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
+
+
+def check_motions(scene) -> None:
+    """Raise an InputError where a scene has a character and no motion to train on: nothing that moves would be learned."""
+    if not scene.motion.files and scene.body.file not in ("", "none") and not scene.moves_by_itself:
+        mend = 'name one, as "walk.fbx" or "ncs:walk"; ncs simulate --motion takes one besides'
+        raise InputError("a motion to train on expected", file=scene.source, field="motion.files", value=[], mend=mend)
+
+
+def check_adapted(options) -> None:
+    """Raise an InputError where the folder of an adapted run is named, and nothing is to be adapted."""
+    if options.adapted and options.adapt is None:
+        there = (Path(options.adapted) / "run.json").exists()
+        mend = f"add --adapt 20, or give {options.adapted} as the RUN" if there else "add --adapt 20"
+        raise InputError("--adapt expected beside it", field="--adapted", value=options.adapted, mend=mend)
 
 
 def check_file(name: str) -> None:
@@ -80,8 +117,28 @@ def check_run(folder: str) -> None:
         raise InputError("no run there", file=Path(folder) / "run.json", mend="give a folder that ncs train made")
 
 
+@contextmanager
+def as_options() -> Iterator[None]:
+    """Name options in errors that name the fields of a scene which they stand for."""
+    try:
+        yield
+    except InputError as error:
+        if error.field not in OPTIONS:
+            raise
+        mend = re.sub(r"\b(?:body|garment)\.\w+", lambda found: OPTIONS.get(found[0], found[0]), error.mend or "")
+        if "body.shapes" in mend:  # which no option gives
+            mend = "leave it out: the file alone says what shape it has"
+        expected = error.expected.replace("this field", "this option")
+        raise InputError(expected, file=error.file, field=OPTIONS[error.field], value=error.value, mend=mend) from None
+
+
 def body_of(options):
     """Return the body that the options of `add_body` mean."""
+    with as_options():
+        return _body_of(options)
+
+
+def _body_of(options):
     from ncs_jax import io
 
     own = {name: getattr(options, f"body_{name}") for name in MOVING}
@@ -122,35 +179,39 @@ def mesh_names(scene) -> tuple[str, str]:
     return (garment, body) if garment != body else ("garment", "body")
 
 
-def positive(text: str) -> float:
-    """Return a number above 0."""
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"a number above 0 expected, found {text}")
-    return value
+def positive(text: str, of: str = "") -> float:
+    """Return a number above 0; `of` says what it counts, as seconds."""
+    return _number(text, f"a number {f'of {of} ' if of else ''}above 0", lambda value: 0 < value < math.inf)
 
 
-def whole(text: str) -> int:
-    """Return a whole number from 1."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"a whole number from 1 expected, found {text}")
-    return value
+def whole(text: str, least: int = 1) -> int:
+    """Return a whole number, at least 1."""
+    return int(_number(text, f"a whole number from {least}", lambda value: value >= least, int))
 
 
 def seed(text: str) -> int:
     """Return a seed, 0 to 2^31 - 1."""
-    value = int(text)
-    if not 0 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"a whole number from 0 to {2**31 - 1} expected, found {text}")
-    return value
+    return int(_number(text, f"a whole number from 0 to {2**31 - 1}", lambda value: 0 <= value < 2**31, int))
 
 
 def finite(text: str) -> float:
     """Return a finite number."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"a finite number expected, found {text}")
+    return _number(text, "a finite number", math.isfinite)
+
+
+def _number(text: str, expected: str, good: Callable[[float], bool], kind: type[float] | type[int] = float) -> float:
+    """Return the number that a text is, or say what is expected; of one with a comma, how it is written with a point."""
+    try:
+        value = kind(text)
+    except ValueError:
+        meant = ""
+        if re.fullmatch(r"-?\d{1,3}(,\d{3})+", text) and kind is int:
+            meant = f"; write {text.replace(',', '')}, without commas"
+        elif re.fullmatch(r"-?\d*,\d+", text) and kind is float:
+            meant = f"; write {text.replace(',', '.')}, with a point"
+        raise argparse.ArgumentTypeError(f"{expected} expected, found {text}{meant}") from None
+    if not good(value):
+        raise argparse.ArgumentTypeError(f"{expected} expected, found {text}")
     return value
 
 

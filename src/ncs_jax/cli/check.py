@@ -45,6 +45,7 @@ def check(options) -> int:
     if Path(options.out).suffix.lower() not in ("", ".png"):
         raise InputError("a name that ends in .png expected", field="--out", value=options.out, mend="pictures are PNG")
     scene = load_scene(options.scene)  # before JAX is imported, which takes a second
+    arguments.check_motions(scene)
 
     from ncs_jax.prepare.scene_checks import find_risks
     from ncs_jax.prepare.setting import set_up

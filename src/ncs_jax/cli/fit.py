@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,12 +41,20 @@ def add_commands(commands) -> None:
     parser.add_argument(
         "--out", required=True, metavar="FILE", help=".npz; beside it a picture, .png, and a scene, .toml, if there is none yet"
     )
-    parser.add_argument("--scale", type=arguments.positive, default=0.0, help="metres a unit of the file (default: found)")
+    parser.add_argument(
+        "--scale",
+        type=partial(arguments.positive, of="metres a unit"),
+        default=0.0,
+        help="metres a unit of the file (default: found)",
+    )
     parser.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="", help="the axis that is up in the file (default: found)"
     )
     parser.add_argument(
-        "--turn", type=int, choices=(0, 90, 180, 270), help="degrees to turn it about the vertical then (default: found)"
+        "--turn",
+        type=partial(arguments.whole, least=0),
+        choices=(0, 90, 180, 270),
+        help="degrees to turn it about the vertical then (default: found)",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--stay", action="store_true", help="do not move it, whatever speaks for another place")
@@ -56,10 +65,12 @@ def add_commands(commands) -> None:
         metavar=("X", "Y", "Z"),
         help="move it by this, metres along the body's axes, Y up, once unit and axes are found (default: found)",
     )
-    parser.add_argument("--weld", type=arguments.positive, default=0.0, metavar="M", help="merge vertices within M metres")
+    parser.add_argument(
+        "--weld", type=partial(arguments.positive, of="metres"), default=0.0, metavar="M", help="merge vertices within M metres"
+    )
     parser.add_argument(
         "--clearance",
-        type=arguments.positive,
+        type=partial(arguments.positive, of="metres"),
         metavar="M",
         help="distance to keep from the body, metres (default: found, so that no skin shows between vertices)",
     )
@@ -70,18 +81,24 @@ def fit(options) -> int:
     for name in filter(None, (options.garment, options.body, options.source)):
         arguments.check_file(name)
     from ncs_jax import io
-    from ncs_jax.prepare.fit import settle
+    from ncs_jax.io.tables.files import check_place
+    from ncs_jax.prepare.fit import check_length, settle
     from ncs_jax.prepare.garment_placement import place
     from ncs_jax.prepare.skinning_weights import with_body_weights
 
+    for name in ("clearance", "weld"):
+        check_length(f"--{name}", getattr(options, name))
     out, scene = Path(options.out), Scene()
     if out.suffix.lower() != ".npz":
         raise InputError(
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
         )
+    if check_place(out).is_dir():
+        raise InputError("a file expected", field="--out", value=options.out, mend="give another name")
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
-    given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
+    with arguments.as_options():
+        given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
     given = with_body_weights(given, source)
     known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
     move = (0.0, 0.0, 0.0) if options.stay else options.move
@@ -113,7 +130,8 @@ def fit(options) -> int:
         use, after = "train", f"ncs train {name} --out {run} --preview"
         if body.frames is not None:
             use, after = "simulate", f"ncs simulate {name} --out {shlex.quote(out.stem)}.glb --body"
-        print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: ncs check {name}, then {after}")
+        first = "name its motions there, then " if "files = []" in text else ""
+        print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: {first}ncs check {name}, then {after}")
     return 0
 
 

@@ -26,8 +26,10 @@ def preview(options) -> int:
     out = options.out or options.folder
     if options.video:
         check_video(out)
+    from ncs_jax.runs.checkpoint import check_writable
     from ncs_jax.runs.run import load_run
 
+    check_writable(Path(out))
     draw(load_run(options.folder), out, options.motion, log=Path(options.folder) / "log.csv", video=options.video)
     return 0
 

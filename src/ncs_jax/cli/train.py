@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,11 @@ def add_commands(commands) -> None:
     """Declare the options."""
     parser = arguments.command(commands, "demo", demo, "train the packaged dress and write pictures and a page that plays it")
     parser.add_argument("--out", default="runs/demo", help="run folder (default: runs/demo)")
-    parser.add_argument("--minutes", type=arguments.positive, help="minutes of training, from the first step on (default: 3)")
+    parser.add_argument(
+        "--minutes",
+        type=partial(arguments.positive, of="minutes"),
+        help="minutes of training, from the first step on (default: 3)",
+    )
     parser.add_argument("--scene", default="ncs:demo", help="another scene file")
 
     parser = arguments.command(commands, "train", train, "train the garment of a scene file from the physics energy alone")
@@ -40,7 +45,10 @@ def add_commands(commands) -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=arguments.whole, help="optimiser steps in all (default: the scene's)")
     length.add_argument(
-        "--minutes", type=arguments.positive, metavar="M", help="as many steps as fit into M minutes, from the first step on"
+        "--minutes",
+        type=partial(arguments.positive, of="minutes"),
+        metavar="M",
+        help="as many steps as fit into M minutes, from the first step on",
     )
     parser.add_argument("--seed", type=arguments.seed, help="seed (default: the scene's)")
     parser.add_argument("--preset", choices=PRESETS, help="speed for accuracy: sizes of the network (default: the scene's)")
@@ -62,6 +70,7 @@ def train(options) -> int:
     if options.video:
         check_video(options.out)
     scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
+    arguments.check_motions(scene)
 
     import jax
 
@@ -92,7 +101,9 @@ def demo(options) -> int:
     out = Path(options.out)
     resume = (out / "run.json").exists()
     minutes = options.minutes if options.minutes or resume else DEMO_MINUTES
-    run = _trained(load_scene(options.scene), out, minutes=minutes, resume=resume)
+    scene = load_scene(options.scene)
+    arguments.check_motions(scene)
+    run = _trained(scene, out, minutes=minutes, resume=resume)
     draw(run, out)
     _warn_of_few_steps(run, None, f"ncs demo --out {shlex.quote(str(out))} --minutes M goes on")
     return 0

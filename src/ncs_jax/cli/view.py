@@ -32,7 +32,8 @@ def view(options) -> int:
     """Serve the page until it is interrupted."""
     for name in (options.target, *options.overlay):
         arguments.check_file(name)
-    target = options.target if options.adapt is None and not options.adapted else _adapted(options)
+    arguments.check_adapted(options)
+    target = options.target if options.adapt is None else _adapted(options)
     from ncs_jax.view import live
 
     window = live.view(
@@ -54,9 +55,8 @@ def view(options) -> int:
 
 def _adapted(options) -> str:
     """Return the folder of the run, adapted to the motion."""
-    if options.adapt is None or not options.motion:
-        field = "--motion" if options.adapt else "--adapted"
-        raise InputError("--motion and --adapt expected together", field=field, mend="add --motion FILE --adapt 20")
+    if not options.motion:
+        raise InputError("a motion expected beside --adapt", field="--motion", mend="add --motion FILE")
     arguments.check_run(options.target)
     from ncs_jax.runs.run import load_run
 

@@ -100,6 +100,7 @@ class MotionRecord:
         source: the skeleton that drives this one, if it is another, in `SHOWN` frames.
         bones: as in a body.
         origin: the number in its file of the first frame, and how many of the file's frames make one of these.
+        absent: names in `motion.joints` that are no joint of this motion, each with the likeliest that is one, or "".
         driven: of a motion that was retargeted, the source's joint for each joint of the body that one drives.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
         uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees;
@@ -122,6 +123,7 @@ class MotionRecord:
     uncertain: dict[str, float] = field(default_factory=dict)
     origin: tuple[int, float] = (0, 1.0)
     driven: dict[str, str] = field(default_factory=dict)
+    absent: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.scene.spec import CollisionSpec
 
-__all__ = ["PINS", "Fitted", "bring_apart", "fit", "pins_of", "push_out", "settle"]
+__all__ = ["PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
 TRIES = 12  # of bringing cloth apart
@@ -31,6 +31,7 @@ OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away 
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
 CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
 BAND = 0.02  # m; height of a waistband
+MOST = 0.1  # m; no clearance is larger, as no thickness of a scene's collision is, nor vertices that are one farther apart
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,14 @@ def fit(file: str | Path, garment: GarmentRecord, body: BodyRecord, *, clearance
     return settle(file, place(file, garment, body, **known), body, clearance=clearance)
 
 
+def check_length(field: str, length: float | None) -> None:
+    """Raise an InputError where a clearance, or a distance to weld within, cannot be in metres; None is none given."""
+    if length is None or 0 <= length <= MOST:
+        return
+    meant = f": {length:g} mm is {field} {length / 1000:g}" if 0 < length <= 1000 * MOST else ""
+    raise InputError(f"metres, {MOST:g} at most, expected", field=field, value=length, mend=f"metres are meant{meant}")
+
+
 def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float | None = None) -> Fitted:
     """Push a placed garment out of the body, and pin it. Its own group `pins` and its own weights, if any, are kept.
 
@@ -63,8 +72,10 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
             None: what keeps the skin from showing between vertices, see `covering.contact_for`.
 
     Raises:
-        InputError: the place is in doubt, or the garment cannot be pushed out of the body there, or passes through itself.
+        InputError: the place is in doubt, or the garment cannot be pushed out of the body there, or passes through itself; or
+            the clearance is more than `MOST`.
     """
+    check_length("--clearance", clearance)
     placement.check(file)
     placed = placement.garment
     before = placed.vertices.astype(np.float64)

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.garment_checks import UNITS
 from ncs_jax.prepare.hanging import CENTRED, SHAPED, Trunk, opening_on, trunk_of, upper_opening
-from ncs_jax.prepare.placement import Placement
+from ncs_jax.prepare.placement import Placement, of_no_size
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.straps import lift_to_rest
 from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, large_loops, pierced, skin_of, threaded
@@ -102,10 +101,7 @@ def place(
     skin, fine = skin_of(body), cloth_of(raw, 600)
     ways = list(_ways(garment, raw, skin, fine.volume < 0, (scale, up, turn)))
     if not ways:
-        raise InputError(
-            "a garment about the size of the body expected, in any unit", file=file, field="vertices",
-            value=f"{np.ptp(garment.vertices, axis=0).max():.3g} of its units", mend="state its unit with --scale",
-        )  # fmt: skip
+        raise of_no_size(file, float(np.ptp(raw.vertices, axis=0).max()), skin.height, scale, SIZES)
     stays, hanging = (None, None) if move is not None else _hung(ways, raw, fine, skin, body)
     if stays is not None and not stays.doubt:
         return stays

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import time
 import warnings
@@ -239,6 +240,7 @@ def load_motions(
         except InputError as error:
             faults[name] = error
     if not faults:
+        _check_joints(scene, motions)
         return scene, motions
     none = bool(scene.motion.files) and not any(name in motions for name in scene.motion.files)
     if scene.motion.broken == "refuse" or none:
@@ -253,6 +255,36 @@ def load_motions(
     warnings.warn(f"{what}:\n{_by_kind(faults)}", category=InputWarning, stacklevel=4)
     files, validation = (tuple(n for n in names if n in motions) for names in (scene.motion.files, scene.motion.validation))
     return replace(scene, motion=replace(scene.motion, files=files, validation=validation)), motions
+
+
+def _check_joints(scene: Scene, motions: Mapping[str, io.MotionRecord]) -> None:
+    """Raise an InputError where `motion.joints` names a joint that none of the motions has which it is said of."""
+    if scene.motion.lone:
+        return
+    said: dict[tuple, list[io.MotionRecord]] = {}
+    for name, record in motions.items():
+        said.setdefault(tuple(scene.motion_file(name)[1].joints.items()), []).append(record)
+    for joints, records in said.items():
+        for name, ours in joints:
+            if all(name in record.absent for record in records):
+                near = next(filter(None, (record.absent[name] for record in records)), "")
+                mend = f'did you mean "{near}" = "{ours}"?' if near else "leave it out, or write a joint of the motion first"
+                raise InputError(
+                    "a joint of the motions expected, and none has it", file=scene.source, field="motion.joints", value=name,
+                    mend=mend,
+                )  # fmt: skip
+
+
+def _absent(motion: io.MotionRecord, joints: Mapping[str, str]) -> dict[str, str]:
+    """Return the names in `motion.joints` that are no joint of a motion as read, each with the likeliest that is one, or ""."""
+    names = motion.joint_names or smpl_names(motion.poses.shape[1])
+    plain = {name.rsplit(":", 1)[-1].lower(): name for name in names}
+    found = {}
+    for name in joints:
+        if name not in names:
+            near = difflib.get_close_matches(name.rsplit(":", 1)[-1].lower(), plain, n=1)
+            found[name] = plain[near[0]] if near else ""
+    return found
 
 
 def _by_kind(faults: Mapping[str, InputError]) -> str:
@@ -281,7 +313,7 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         read = (
             partial(_frames, record) if chosen is None else lambda start, stop: io.read_motion(path, frame_range=(start, stop))
         )
-        count = len(record.poses)
+        count, absent = len(record.poses), _absent(record, spec.joints)
         record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
     except InputError as error:
         if error.file is not None:
@@ -301,4 +333,4 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         poses, moved = resample(*given, float(record.fps), scene.motion.fps)
         translation = begin + moved
     origin, fps = (first, float(record.fps) / scene.motion.fps), scene.motion.fps
-    return replace(record, poses=poses, translation=translation, fps=fps, origin=origin)
+    return replace(record, poses=poses, translation=translation, fps=fps, origin=origin, absent=absent)

@@ -9,8 +9,11 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.records import GarmentRecord
+from ncs_jax.prepare.garment_checks import UNITS
 
-__all__ = ["Placement"]
+__all__ = ["Placement", "of_no_size"]
+
+USUAL = (0.01, 0.001, 0.0254, 0.3048, 1.0)  # metres a unit, of modellers
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,3 +72,32 @@ class Placement:
                 value=f"as its best place {self.options}", mend=f"{other}if the picture is right, give these options; "
                 "else others of --scale, --up, --turn and --move, or --stay",
             )  # fmt: skip
+
+
+def of_no_size(file: str | Path, size: float, tall: float, scale: float | None, sizes: tuple[float, float]) -> InputError:
+    """Return the error of a garment that is not worn in any unit, or not in the one that its user gave.
+
+    A unit is often given in centimetres or millimetres, or as so many to a metre: the mend names it in metres, where the
+    garment has some size then, and else the units in which it would have one.
+
+    Args:
+        file: the garment's. size: of the garment, units of its file. tall: the body's height, m. scale: the unit that was
+            given, m. sizes: least and most size of what is worn, in heights of the body.
+    """
+    expected = f"a garment about the size of the body ({tall:.2f} m) expected, in any unit"
+    if scale is None:
+        value = f"{size:.3g} of its units"
+        return InputError(expected, file=file, field="vertices", value=value, mend="state its unit with --scale, in metres")
+
+    def worn(unit: float) -> bool:
+        return sizes[0] * tall <= size * unit <= sizes[1] * tall
+
+    def known(unit: float) -> bool:
+        return any(abs(unit / usual - 1) < 0.02 for usual in USUAL)
+
+    meant = {"centimetres": scale / 100, "millimetres": scale / 1000, "units to a metre": 1 / scale}
+    told = [f"{scale:g} {what} is --scale {unit:.4g}" for what, unit in meant.items() if worn(unit) and known(unit)]
+    told = told[:1] or [f"--scale {unit:g} for {UNITS[unit]}" for unit in USUAL if worn(unit)]
+    mend = f"metres a unit are meant: {', '.join(told)}" if told else "leave it out, so that it is found"
+    expected = f"a unit in which the garment is about the size of the body ({tall:.2f} m) expected, in metres"
+    return InputError(expected, file=file, field="--scale", value=f"{scale:g}, {size * scale:.3g} m", mend=mend)

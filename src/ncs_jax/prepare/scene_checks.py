@@ -6,6 +6,7 @@ and nothing fails; outside them a scene is at risk. What cannot work at all is r
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -47,6 +48,7 @@ MANY = 0.02  # and the share of the vertices that may be deeper
 POSES = 8  # checked in every motion
 MOST = 400  # poses that are checked in all motions together
 NAMED = 6  # motions that a risk names
+CUT = re.compile(r"its header says (\d+) frames, (\d+) are there and taken(.*)")  # a note of the reader of .bvh
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
 
 
@@ -229,6 +231,18 @@ def _undriven(record: MotionRecord, name: str) -> Iterator[Risk]:
         yield Risk(name, f"{limb} is driven by nothing", "it keeps the angle of the rest pose", mend, name)
 
 
+def _cut_short(record: MotionRecord, name: str, frames: tuple[int, ...]) -> Iterator[Risk]:
+    """Yield a risk where a motion's file ends before its header says, unless the scene says which frames it means.
+
+    One frame fewer, and none in parts, is how some tools count.
+    """
+    for note in record.notes if not frames else ():
+        said = CUT.match(note)
+        if said and int(said[1]) - int(said[2]) > (0 if said[3] else 1):
+            value = f"{said[2]} of the {said[1]} frames that its header says are there, in {name}"
+            yield Risk("a file that is cut short", value, "the motion ends in its middle", "export it or copy it again", name)
+
+
 def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
     """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most; and for
     each motion whose zero pose is bent in one part as no frame is."""
@@ -260,7 +274,9 @@ def _posture(a: Setting, name: str) -> Iterator[Risk]:
 
 def motion_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[Risk]:
     """Return what puts a scene at risk in its motions themselves, whatever is worn; `say` is told how far it is with many."""
-    found = [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    spec = a.scene.motion_file
+    found = [risk for name, record in a.motions.items() for risk in _cut_short(record, name, spec(name)[1].frames)]
+    found += [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
     found += _uncertain(a.motions)
     for name in one_by_one(a.motions, "looking for what is too fast", say):
         found += [Risk(*fault, name) for fault in speed_faults(a, name)]

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ncs_jax import io
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.methods.choose import network_from
@@ -144,18 +145,16 @@ def _assemble_started(
     _check_swing(before.prepared, name)
     if scene.network.cell == "auto":
         scene = replace(scene, network=replace(scene.network, cell=before.scene.network.cell))
+    _check_garment(name, before, scene)
     if network is None:
         _check_network(name, before.scene.network, scene)
     if not scene.body.joints:
+        _check_body(name, before, scene)
         scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
     same = (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment)
     swings = same and network is None and before.model.vibrations is not None
     # Its vibrations are known: made ready as one that does not swing, no minute is spent on looking for them.
     assembly = make_ready(replace(scene, network=replace(scene.network, cell="gated")) if swings else scene)
-    if not np.array_equal(before.garment.faces, assembly.garment.faces):
-        size = f"{len(assembly.garment.vertices)} vertices, {len(assembly.garment.faces)} triangles"
-        expected = f"the triangles of the garment of {name} expected, {len(before.garment.faces)}"
-        raise InputError(expected, file=scene.source, field="garment.file", value=size, mend="train this garment anew")
     if swings:
         check_static(assembly.model, assembly.model.terms.own, assembly.track)
         assembly = replace(_swinging(before.prepared, assembly), scene=scene)
@@ -168,6 +167,37 @@ def _assemble_started(
         told = f"the network of {name} does not read joints that turn in the motions: {', '.join(unread)}"
         warnings.warn(f"{told}; what they do to the garment is not learned", category=InputWarning, stacklevel=4)
     return assembly, jax.tree.map(jnp.array, run.params)  # copies: training uses up what it is given
+
+
+def _check_garment(name: str, before: Assembly, scene: Scene) -> None:
+    """Raise an InputError where a scene has a garment of other triangles than a run: before anything is made ready."""
+    spec = scene.garment
+    given = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    if not np.array_equal(before.garment.faces, given.faces):
+        kept = f"{before.scene.garment.file} with {len(before.garment.faces)} triangles"
+        raise InputError(
+            f"the garment of {name} expected, {kept}, which its weights are for", file=scene.source, field="garment.file",
+            value=f"{spec.file}, {len(given.faces)} triangles", mend="train this garment anew, without --from",
+        )  # fmt: skip
+
+
+def _check_body(name: str, before: Assembly, scene: Scene) -> None:
+    """Raise an InputError where a scene has a body without the joints that the network of a run reads."""
+    kept, given = (str(a.path(a.body.file).resolve()) for a in (before.scene, scene))
+    if before.body is None or kept == given or (scene.body.file not in ("", "none") and scene.moves_by_itself):
+        return
+    lacking, joints = list(_joints(before)), []
+    if scene.body.file not in ("", "none"):
+        body = io.read_body(scene.path(scene.body.file), part=scene.body.meshes, correctives=False)
+        joints = [*body.joint_names, *map(str, range(len(body.parents)))]
+    lacking = [joint for joint in lacking if joint not in joints]
+    if lacking:
+        more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+        raise InputError(
+            f"the body of {name} expected, {before.scene.body.file}, whose joints its network reads", file=scene.source,
+            field="body.file", value=f"{scene.body.file}, without joint {lacking[0]}{more}",
+            mend="train on this body anew, without --from",
+        )  # fmt: skip
 
 
 def _check_network(name: str, before: NetworkSpec, scene: Scene) -> None:

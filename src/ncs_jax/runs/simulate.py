@@ -153,7 +153,7 @@ def simulate(
     # What can be touched is found out from this motion.
     lone = replace(
         scene.without_network(),
-        motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False),
+        motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False, lone=True),
     )
     precision = scene.simulation.precision
     if precision != "double":

@@ -12,6 +12,9 @@ __all__ = ["LISTS", "named_motions", "split_frames", "with_settings"]
 
 LISTS = ("files", "validation")  # the fields of [motion] that list motions
 SLICE = re.compile(r"(?P<file>.+)\[(?P<inner>[^\[\]]*:[^\[\]]*)\]", re.DOTALL)
+# Brackets without a colon, behind what can only be a motion: elsewhere they may be a pattern's, take[1-4]/*.bvh.
+KINDS = r"\.(?:npz|h5|hdf5|bvh|glb|gltf|vrm|vrma|fbx|txt|csv|tsv|lst|list)(?:#[^\[\]]*)?"
+BARE = re.compile(rf"(?P<file>ncs:[^\[\]]+|.+{KINDS})\s*\[(?P<inner>[^\[\]]*)\]", re.DOTALL | re.IGNORECASE)
 
 
 def split_frames(name: str) -> tuple[str, tuple[int, ...] | None]:
@@ -20,19 +23,25 @@ def split_frames(name: str) -> tuple[str, tuple[int, ...] | None]:
     As for a slice in Python, either number may be left out, and one below 0 counts from the end.
 
     Raises:
-        InputError: there is a colon in brackets, but no two numbers around it.
+        InputError: there is a colon in brackets, but no two numbers around it; or brackets without one behind a motion.
     """
-    found = SLICE.fullmatch(name)
+    found = SLICE.fullmatch(name) or BARE.fullmatch(name)
     if found is None:
         return name, None
     numbers = re.fullmatch(r"\s*(-?\d+)?\s*:\s*(-?\d+)?\s*", found["inner"])
     if numbers is None:
         raise InputError(
             "frames as [START:STOP] expected, START: or :STOP alone too", field="motion", value=name,
-            mend=f"write {found['file']}[10:300]",
+            mend=f"write {found['file'].rstrip()}[{_meant(found['inner'])}]",
         )  # fmt: skip
     start, stop = numbers.groups()
     return found["file"], (int(start or 0),) if stop is None else (int(start or 0), int(stop))
+
+
+def _meant(inner: str) -> str:
+    """Return the frames that brackets mean where they hold one or two numbers, 1-40 or 1,40; else an example."""
+    numbers = re.fullmatch(r"\D*?(-?\d+)(?:\D+(\d+))?\D*", inner)
+    return "10:300" if numbers is None else f"{numbers[1]}:{numbers[2] or ''}"
 
 
 def named_motions(

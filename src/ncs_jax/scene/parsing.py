@@ -1,15 +1,72 @@
-"""Tables of a scene file to dataclasses: every key a field, every value of its type and in its range."""
+"""A scene file to tables, and these to dataclasses: every key a field, every value of its type and in its range."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
+import tomllib
 import types
 import typing
+from collections.abc import Iterator
+from pathlib import Path
 
 from ncs_jax.errors import InputError
 
-__all__ = ["checked_value", "parse_table"]
+__all__ = ["checked_value", "parse_table", "read_toml"]
+
+SINGLE = "or put the path in single quotes"
+BACKSLASHES = r"\\+"
+BACKSLASH = re.compile(r'"[^"]*\\[^"]*"')
+UNQUOTED = re.compile(r"\s*(?P<key>[\w.-]+)\s*=\s*(?P<value>(?!true\b|false\b)[A-Za-z_./~][^\"'#]*?)\s*(?:#.*)?")
+
+
+def read_toml(file: Path) -> dict:
+    """Return the tables of a TOML file.
+
+    Raises:
+        InputError: it cannot be read or is not TOML, or a text has a tab or a line's end, as "C:\\temp" in double quotes has.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
+        tables = tomllib.loads(text)
+    except FileNotFoundError:
+        raise InputError("no such scene file", file=file, mend="check the path, or try ncs:tshirt") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise _not_toml(file, text, error) from None
+    for where, value in _texts(tables, ""):
+        if re.search(r"[\x00-\x1f\x7f]", value):
+            raise InputError(
+                "a text without tabs and ends of lines expected, which a backslash in double quotes may mean", file=file,
+                field=where, value=value, mend=f"write / in the place of a backslash, {SINGLE}",
+            )  # fmt: skip
+    return tables
+
+
+def _not_toml(file: Path, text: str, error: tomllib.TOMLDecodeError) -> InputError:
+    """Return the error of a file that is not TOML: with its line, and the mend of what is usual."""
+    found = re.search(r"at line (\d+)", str(error))
+    line = text.splitlines()[int(found[1]) - 1].strip() if found and int(found[1]) <= len(text.splitlines()) else None
+    mend = "correct that line"
+    if line and (path := BACKSLASH.search(line)):
+        mend = f"a backslash in double quotes begins a sign: write {re.sub(BACKSLASHES, '/', path[0])}, {SINGLE}"
+    elif line and (bare := UNQUOTED.fullmatch(line)):
+        mend = f'text stands in quotes: {bare["key"]} = "{bare["value"]}"'
+    return InputError(f"not TOML: {error}: {line[:80]}" if line else f"not TOML: {error}", file=file, mend=mend)
+
+
+def _texts(value, where: str) -> Iterator[tuple[str, str]]:
+    """Yield the texts in tables and lists, each with what an error calls its place."""
+    if isinstance(value, str):
+        yield where, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _texts(item, f"{where}.{key}".lstrip("."))
+    elif isinstance(value, list):
+        for number, item in enumerate(value):
+            yield from _texts(item, f"{where}[{number}]")
 
 
 def parse_table(cls, tables, source: str, where: str):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import tomllib
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from typing import Any
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_lists import each_motion
 from ncs_jax.scene.motion_names import LISTS, named_motions, split_frames, with_settings
-from ncs_jax.scene.parsing import checked_value, parse_table
+from ncs_jax.scene.parsing import checked_value, parse_table, read_toml
 
 __all__ = [
     "PRESETS",
@@ -104,7 +103,8 @@ class MotionSpec:
     """[motion]: what the character does."""
 
     files: tuple[str, ...] = _f(
-        ("ncs:walk",), "motions to train on: FILE, FILE[10:300], FOLDER, *.bvh, LIST.txt; empty: the character stands still"
+        ("ncs:walk",),
+        "motions to train on: FILE, FILE[10:300], FOLDER, *.bvh, LIST.txt; empty: none, for cloth without a character",
     )
     validation: tuple[str, ...] = _f((), "motions to validate on, not to train on")
     fps: float = _f(30.0, "frames per second of the physics", low=1, high=1000)
@@ -123,6 +123,7 @@ class MotionSpec:
     broken: str = _f("refuse", "motions that cannot be used: refuse the scene; or skip them", choices=("refuse", "skip"))
     own: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})  # by motion, what its table says
     found: tuple[str, ...] = field(default=(), metadata={"internal": True})  # in words, what names of many motions stand for
+    lone: bool = field(default=False, metadata={"internal": True})  # one motion, which `joints` need not be meant for
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ class Scene:
         tables["body"] |= {name: absolute(tables["body"][name]) for name in ("file", "mesh")}
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
         tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
-        own, _ = tables["motion"].pop("own"), tables["motion"].pop("found")
+        own, _, _ = (tables["motion"].pop(name) for name in ("own", "found", "lone"))
         for key in LISTS:
             given = [(name, split_frames(name)[0]) for name in tables["motion"][key]]
             tables["motion"][key] = [
@@ -326,14 +327,7 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
         kind = "a folder" if file.is_dir() else f"a {file.suffix or 'file without suffix'}"
         mend = "of a garment, ncs fit writes one; of a run, ncs view and ncs evaluate read its folder"
         raise InputError("a scene file that ends in .toml expected", file=file, value=kind, mend=mend)
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such scene file", file=file, mend="check the path, or try ncs:tshirt") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, mend="give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", file=file, mend="correct that line") from None
+    tables = read_toml(file)
     if preset is not None and preset not in PRESETS:
         raise InputError(f"one of {', '.join(PRESETS)} expected", field="preset", value=preset)
     for table, values in PRESETS[preset].items() if preset else ():

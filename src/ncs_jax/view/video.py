@@ -7,7 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.tables.files import replacing
+from ncs_jax.io.tables.files import check_place, replacing
 from ncs_jax.view.animation import Animation
 from ncs_jax.view.pictures import drawn_frames
 
@@ -19,7 +19,9 @@ LIMITED = 1  # brightness from 16 to 235
 
 
 def check_video(file: str | Path) -> None:
-    """Raise an InputError where the package that encodes videos is not installed."""
+    """Raise an InputError where the package that encodes videos is not installed, or the place cannot be written to."""
+    if check_place(file).is_dir():
+        raise InputError("a file expected", file=file, value="a folder", mend="give another name")
     try:
         import av  # noqa: F401
     except ImportError:

@@ -16,7 +16,7 @@ from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
 from ncs_jax.io.mesh.usd import USD, check_installed, read_usd_animation, write_usd
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
-from ncs_jax.io.tables.files import replacing
+from ncs_jax.io.tables.files import check_place, replacing
 from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices
@@ -81,17 +81,20 @@ def write_animation(
         _write_folder(file, x, obj_faces(triangles, maps), float(fps))
 
 
-def animation_suffix(path: str | Path, *, with_body: bool = False) -> str:
+def animation_suffix(path: str | Path, *, with_body: bool = False, also: tuple[str, ...] = ()) -> str:
     """Return the suffix of a file that an animation, perhaps with a body, can be written to, or nothing for a folder.
 
+    `also` are suffixes that the caller writes by other means, for the error.
+
     Raises:
-        InputError: no such format is written or it holds no body, a package for it is not there, or a folder stands where the
-            file shall be.
+        InputError: no such format is written or it holds no body, a package for it is not there, a folder stands where the
+            file shall be, something else is in the folder, or the place cannot be written to.
     """
     file = Path(path)
     suffix = "" if str(path).endswith(("/", "\\")) else file.suffix.lower()
     if suffix and suffix not in FORMATS:
-        raise InputError(f"one of {', '.join(FORMATS)}, or a folder, expected", file=file, value=suffix, mend="end the name so")
+        known = ", ".join((*FORMATS, *also))
+        raise InputError(f"one of {known}, or a folder, expected", file=file, value=suffix, mend="end the name so")
     if suffix and file.expanduser().is_dir():
         raise InputError("a file expected", file=file, value="a folder", mend="give another name")
     if with_body and suffix != ".glb":
@@ -101,22 +104,27 @@ def animation_suffix(path: str | Path, *, with_body: bool = False) -> str:
         )
     if suffix in USD:
         check_installed(file)
+    there = check_place(file)
+    if not suffix:
+        _check_folder(file, there)
     return suffix
+
+
+def _check_folder(path: Path, folder: Path) -> None:
+    """Raise an InputError where a folder for frames is a file, or holds something else."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError("a folder expected", file=path, value="a file", mend="give another name, or a suffix")
+    names = (p.name for p in folder.iterdir()) if folder.exists() else ()
+    other = next((name for name in names if not re.fullmatch(r"frame_\d+\.obj", name)), None)
+    if other is not None:
+        raise InputError("an empty or new folder expected", file=path, value=other, mend="give another name, or a suffix")
 
 
 def _write_folder(path: Path, vertices: np.ndarray, faces: str, fps: float) -> None:
     """Write a file a frame; `faces` is text of `obj_faces`."""
     folder = path.expanduser()
     with replacing(folder) as part:
-        if folder.exists() and not folder.is_dir():
-            raise InputError("a folder expected", file=path, value="a file", mend="give another name, or a suffix")
-        other = (
-            next((p.name for p in folder.iterdir() if not re.fullmatch(r"frame_\d+\.obj", p.name)), None)
-            if folder.exists()
-            else None
-        )
-        if other is not None:
-            raise InputError("an empty or new folder expected", file=path, value=other, mend="give another name, or a suffix")
+        _check_folder(path, folder)
         part.mkdir()
         for t, x in enumerate(vertices):
             (part / f"frame_{t:04}.obj").write_text(

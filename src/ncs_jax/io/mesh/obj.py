@@ -17,6 +17,8 @@ from ncs_jax.io.tables.files import text_of
 
 __all__ = ["Polygons", "format_obj", "obj_faces", "polygons_of", "read_obj"]
 
+FAR = 1e30  # what is farther, or no number, is none that single precision has
+
 
 class Polygons(NamedTuple):
     """What an .obj holds as it stands there, not checked: vertices (V, 3), texture coordinates (N, 2), and polygons by corner.
@@ -122,8 +124,11 @@ def _numbers(file: Path, line: int, words: list[str], count: int) -> list[float]
         numbers = []
     if words[0] == "vt" and len(numbers) == 1:
         numbers.append(0.0)
-    if len(numbers) != count:
-        raise InputError(f"{count} numbers expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
+    if len(numbers) != count or not all(abs(number) < FAR for number in numbers):
+        raise InputError(
+            f"{count} finite numbers expected", file=file, field=f"line {line}", value=" ".join(words)[:60],
+            mend="mend that line, or export the mesh again",
+        )  # fmt: skip
     return numbers
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ncs_jax.errors import InputError
 
-__all__ = ["LARGEST", "decoded", "readable", "reading", "replacing", "text_of", "unpackable"]
+__all__ = ["LARGEST", "check_place", "decoded", "readable", "reading", "replacing", "text_of", "unpackable"]
 
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
 PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
@@ -104,15 +104,29 @@ def unpackable(file: Path, field: str, size: int) -> None:
         )  # fmt: skip
 
 
+def check_place(path: str | Path) -> Path:
+    """Return the path of a file that is to be written later. Raise an InputError where it cannot be, before work is lost.
+
+    That is where its folder, or the one that this is to be made in, is a file or may not be written to.
+    What is there already, `replacing` replaces.
+    """
+    file = Path(path).expanduser()
+    if "\0" in str(file) or not file.name:
+        raise InputError("a file name expected", file=file, value=str(path), mend="name a file")
+    there = next(folder for folder in file.absolute().parents if os.path.exists(folder))  # which raises nothing
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        kind = "may not be written to" if there.is_dir() else "is not a folder"
+        raise InputError(f"cannot be written: {there} {kind}", file=file, mend="choose a place that you may write to")
+    return file
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to; it takes the place of `path` once all is written, else it is removed.
 
     Missing parent folders are made. A folder may replace a folder: the caller first checks what would be lost.
     """
-    file = Path(path).expanduser()
-    if "\0" in str(file) or not file.name:
-        raise InputError("a file name expected", file=file, value=str(path), mend="name a file")
+    file = check_place(path)
     part = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}.part{file.suffix}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
