@@ -7,12 +7,14 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ncs_jax.cli import main
 from ncs_jax.io import MotionRecord
+from ncs_jax.prepare import scene_checks
 from ncs_jax.prepare.scene_checks import RANGES, find_risks
 from ncs_jax.prepare.speed_checks import FLUNG, flung, frames_named, good_stretches, thrown
 from ncs_jax.runs.run import assemble
@@ -219,3 +221,22 @@ def test_a_spin_puts_a_swing_at_risk(tmp_path, plain_jax):
         motion["poses"][:, 0, 1] = (2 * np.pi * turns * np.arange(90) / 30 + np.pi) % (2 * np.pi) - np.pi
         values = [risk.value for risk in found(tmp_path, text, motion) if risk.what == "fast motion"]
         assert bool(values) == told and all("flung off the turning body" in value for value in values)
+
+
+def test_what_was_found_is_kept_for_the_same_scene(tmp_path, plain_jax, monkeypatch):
+    looked = []
+    looked_for = scene_checks._looked_for
+    monkeypatch.setattr(scene_checks, "_looked_for", lambda *a: looked.append(a) or looked_for(*a))
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "kept"))
+    try:
+        heavy = SOUND.replace("[network]", "[physics]\ndensity = 20.0\n[network]")
+        first = found(tmp_path, heavy)
+        assert first and found(tmp_path, heavy) == first and len(looked) == 1
+        assert found(tmp_path) == [] and len(looked) == 2
+        faster = swing()
+        faster["poses"] *= 1.01
+        found(tmp_path, heavy, motion=faster)
+        assert len(looked) == 3
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -418,9 +418,7 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "40")
     resumed = train(scene, tmp_path / "run", resume=True, report=reports.append)
     assert reports[-1].step == 40
-    assert re.fullmatch(
-        r"the cloth goes along with [1-9] % of its swing, [01]\.\d+ of \d\d mm: .*", reports[-1].message
-    )
+    assert re.fullmatch(r"the cloth goes along with [1-9] % of its swing, [01]\.\d+ of \d\d mm: .*", reports[-1].message)
     jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
     np.testing.assert_array_equal(resumed.assembly.model.vibrations.by_pose, made.assembly.model.vibrations.by_pose)
     _refuse_an_earlier_swing(scene, tmp_path / "run")

@@ -6,9 +6,10 @@ and nothing fails; outside them a scene is at risk. What cannot work at all is r
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
+from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.posture_checks import posture_faults
@@ -286,7 +288,25 @@ def motion_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> lis
 
 
 def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[Risk]:
-    """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe."""
+    """Return all that puts a scene at risk, from its motions, material, mesh and fit; none where it is safe.
+
+    What was found in the same scene before is kept, see `kept`; not of garments worn over others, whose networks tell.
+    """
+    if a.model.under:
+        return _looked_for(a, say)
+
+    def make() -> dict[str, np.ndarray]:
+        return {"risks": np.frombuffer(json.dumps([astuple(risk) for risk in _looked_for(a, say)]).encode(), np.uint8)}
+
+    files = [asdict(record) for record in (a.garment, *filter(None, (a.body, *a.motions.values())))]
+    found = required(
+        kept(("risks",), make, a.model, asdict(a.prepared), files, tuple(a.motions), str(a.scene.to_dict())), "risks"
+    )
+    return [Risk(*risk) for risk in json.loads(found["risks"].tobytes())]
+
+
+def _looked_for(a: Setting, say: Callable[[str], None]) -> list[Risk]:
+    """Return what `find_risks` does, without having kept anything."""
     found = motion_risks(a, say)
     body, faces = a.body, None
     if a.model.body is not None and body is not None:
