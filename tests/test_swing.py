@@ -421,7 +421,20 @@ def test_training_resuming_and_coming_back(tmp_path, plain_jax, monkeypatch):
     assert re.fullmatch(r"the cloth goes along with [1-9] % of its swing, [01]\.\d+ of \d\d mm: .*", reports[-1].message)
     jax.tree.map(np.testing.assert_array_equal, resumed.params, made.params)
     np.testing.assert_array_equal(resumed.assembly.model.vibrations.by_pose, made.assembly.model.vibrations.by_pose)
+    _begin_with_its_vibrations(scene, tmp_path, monkeypatch)
     _refuse_an_earlier_swing(scene, tmp_path / "run")
+
+
+def _begin_with_its_vibrations(scene, folder, monkeypatch):
+    """Those of the same garment are not looked for again, also where its path is relative; of another material they are."""
+    scene = replace(scene, garment=replace(scene.garment, file="cloth.npz"))
+    with monkeypatch.context() as patch:
+        patch.setattr("ncs_jax.prepare.build.kept", lambda *_: pytest.fail("looked for"))
+        begun = train(scene, None, steps=10, start=folder / "run")
+        assert begun.assembly.model.vibrations.by_pose is not None
+        heavier = replace(scene, physics=replace(scene.physics, density=0.3))
+        with pytest.raises(pytest.fail.Exception):
+            train(heavier, None, steps=10, start=folder / "run")
 
 
 def _refuse_an_earlier_swing(scene, folder):
@@ -461,7 +474,7 @@ def test_cloth_that_hangs_on_nothing_is_refused(tmp_path):
 
 
 def test_the_default_cell_is_gated_where_no_vibration_is_found(tmp_path, monkeypatch):
-    monkeypatch.setattr("ncs_jax.simulation.ritz_modes.softest_ritz_modes", lambda *_: None)
+    monkeypatch.setattr("ncs_jax.prepare.build.kept", lambda *_: None)
     scene = load_scene(write_scene(tmp_path, SCENE.replace('cell = "gated"\n', "")))
     found = assemble(scene)
     assert scene.network.cell == "auto" and with_cell(scene).network.cell == "swing"

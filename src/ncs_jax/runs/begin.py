@@ -151,7 +151,8 @@ def _assemble_started(
     if not scene.body.joints:
         _check_body(name, before, scene)
         scene = replace(scene, body=replace(scene.body, joints=_joints(before)))
-    same = (before.scene.physics, before.scene.garment) == (scene.physics, scene.garment)
+    tables = [each.to_dict() for each in (before.scene, scene)]  # with whole paths
+    same = all(tables[0][name] == tables[1][name] for name in ("physics", "garment"))
     swings = same and network is None and before.model.vibrations is not None
     # Its vibrations are known: made ready as one that does not swing, no minute is spent on looking for them.
     assembly = make_ready(replace(scene, network=replace(scene.network, cell="gated")) if swings else scene)
