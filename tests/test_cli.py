@@ -464,7 +464,7 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
         "ncs: warning: 0.001 minutes hold about 10 steps on this machine, up to step 20: too few to learn from"
     )
     assert re.search("300 steps in all take about [0-9]+ minutes more$", first)
-    assert last.startswith("ncs: warning: only 20 steps fitted in")
+    assert last.startswith("ncs: warning: only 20 steps were taken")
     assert last.endswith(f"--resume --minutes M goes on, with the scene that {out}/run.json keeps")
     with pytest.raises(SystemExit):
         main([*line, "--minutes", "1", "--steps", "30"])
@@ -611,6 +611,31 @@ def test_a_place_that_cannot_be_written_is_refused_before_any_work(run_folder, t
     words = {"full": "an empty or new folder expected (found 'letter.txt')", "taken.glb": "a file expected (found 'a folder')"}
     one_line(capsys, [words.get(PLACES[line], f"{tmp_path / 'file'} is not a folder")])
     assert sorted(tmp_path.rglob("*")) == before
+
+
+READ = {
+    "animate RUN --out": "cloth.npz",
+    "animate RUN --motion DIR/swing.npz[0:5] --out": "swing.npz",
+    "animate RUN --adapt 20 --out": "body.npz",
+    "simulate SCENE --out": "cloth.npz",
+    "body --body DIR/body.glb --out": "body.glb",
+    "fit DIR/cloth.npz --body DIR/body.npz --out": "cloth.npz",
+    "fit DIR/cloth.npz --body ncs:body --from DIR/body.npz --out": "body.npz",
+}
+
+
+@pytest.mark.parametrize("line", READ)
+def test_what_is_read_is_not_written_over(run_folder, capsys, line):
+    scene, folder = run_folder
+    file = scene.parent / READ[line]
+    if not file.exists():
+        file.write_bytes(b"a body")
+    before = file.read_bytes()
+    places = {"RUN": str(folder), "SCENE": str(scene)}
+    words = [places.get(word, word.replace("DIR", str(scene.parent))) for word in line.split()]
+    assert main([*words, str(file)]) == 2
+    one_line(capsys, [f"--out: another file than those that are read expected (found '{file}'); give another name"])
+    assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize(("command", "video"), [("animate", ".glb, .mp4, or a folder"), ("simulate", ".glb, or a folder")])

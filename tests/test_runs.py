@@ -28,7 +28,7 @@ from ncs_jax.scene.spec import load_scene
 from ncs_jax.training.devices import free_memory
 from ncs_jax.training.step import initial_state
 
-from .scenes import FREE, grid, post, swing, write_scene
+from .scenes import FREE, SCENE, grid, post, swing, write_scene
 
 STEPS = 60
 SOURCE = Path(__file__).parents[1] / "src"
@@ -394,3 +394,16 @@ def test_a_first_frame_takes_few_programs(tmp_path, plain_jax):
     jax.block_until_ready(jax.jit(step)(init(), eye, np.zeros(3, np.float32), 1.0))
     count = compiled.count("/jax/core/compile/backend_compile_duration")
     assert 2 <= count <= 12
+
+
+def test_a_run_that_looks_at_its_worst_frames_is_resumed_bit_for_bit(tmp_path, plain_jax):
+    text = SCENE.replace("[training]", "[training]\nfocus = 0.5")
+    scene, out = write_scene(tmp_path, text), tmp_path / "run"
+    train(scene, out, steps=30)
+    whole = leaves(out)
+    plain = train(write_scene(tmp_path, text.replace("focus = 0.5", "focus = 0.0")), tmp_path / "plain", steps=30)
+    assert any(not np.array_equal(a, b) for a, b in zip(whole, jax.tree.leaves(plain.params), strict=True))
+    write_scene(tmp_path, text)
+    shutil.rmtree(out / "checkpoints" / "30")
+    train(scene, out, resume=True)
+    jax.tree.map(np.testing.assert_array_equal, leaves(out), whole)

@@ -18,7 +18,7 @@ from ncs_jax.geometry.skinning import blend, skin
 from ncs_jax.scene.model import pose_body
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.scene.step_inputs import step_inputs
-from ncs_jax.training.batches import CHUNK, batches, chunks
+from ncs_jax.training.batches import CHUNK, batches, chunks, focused
 from ncs_jax.training.loss import physics, with_bodies
 from ncs_jax.training.metrics import diagnose, training_metrics
 from ncs_jax.training.step import chunk_runner, initial_state, step_size
@@ -261,3 +261,12 @@ def test_step_size_falls_to_two_percent(tmp_path):
     spec = load_scene(write_scene(tmp_path)).training
     assert float(step_size(spec, 0, 100)) == pytest.approx(spec.learning_rate)
     assert float(step_size(spec, 100, 100)) == pytest.approx(0.02 * spec.learning_rate)
+
+
+def test_a_share_of_a_batch_is_drawn_where_contact_costs_most():
+    ends = batches(40, 20, 0, 0, 30)
+    weight = np.where(np.arange(40) == 7, 1000.0, 1.0)
+    more = focused(ends, np.arange(40), weight, 0.5, 0, 0)
+    assert ((more == 7).sum(axis=1) >= 8).all() and ((more != ends).sum(axis=1) <= 10).all()
+    np.testing.assert_array_equal(more[10:], focused(ends[10:], np.arange(40), weight, 0.5, 0, 10))  # as a resumed run sees it
+    assert set(focused(ends, np.arange(100, 140), weight, 0.9, 0, 0)[more != ends]) <= set(range(100, 140)) | set(range(40))

@@ -177,6 +177,7 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
         value = ", ".join(options.motion)
         raise InputError("one motion expected without --adapt", field="--motion", value=value, mend="add --adapt 20")
     run = load_run(options.folder)
+    arguments.check_scene_kept(options.out, run.assembly.scene, *options.motion)
     motions = options.motion or list(run.assembly.scene.motions[:1])
     if not motions:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")

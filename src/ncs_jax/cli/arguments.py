@@ -25,7 +25,9 @@ __all__ = [
     "check_adapted",
     "check_file",
     "check_motions",
+    "check_not_read",
     "check_run",
+    "check_scene_kept",
     "command",
     "finite",
     "hosts",
@@ -109,6 +111,27 @@ def check_file(name: str) -> None:
     """Raise an InputError where a file or folder is not there: at once, before JAX is imported, which takes seconds."""
     if not name.startswith("ncs:") and not Path(name).exists():
         raise InputError("no such file", file=name, mend="check the path")
+
+
+def check_not_read(out: str, *read: str | Path) -> None:
+    """Raise an InputError where a file that is to be written is one of those that are read: it would be gone."""
+    place = Path(out).expanduser()
+    for name in read:
+        file = Path(re.sub(r"(\.\w+)(#[^/]*)?(\[[^/]*\])?$", r"\1", str(name))).expanduser()  # without an animation and frames
+        if place.exists() and file.exists() and place.samefile(file):
+            raise InputError(
+                "another file than those that are read expected",
+                field="--out",
+                value=out,
+                mend="give another name: this one is read",
+            )
+
+
+def check_scene_kept(out: str, scene, *motions: str) -> None:
+    """Raise an InputError where a file that is to be written is one that a scene, or a motion beside it, is read from."""
+    given = scene.body.file, scene.body.mesh, scene.garment.file, *scene.garment.over, *scene.motions
+    own = [scene.path(name) for name in given if name not in ("", "none") and not name.startswith("ncs:")]
+    check_not_read(out, *filter(None, [scene.source]), *own, *motions)
 
 
 def check_run(folder: str) -> None:

@@ -18,6 +18,7 @@ def body(options) -> int:
     """Write a body at rest, and print what it is."""
     from ncs_jax import io
 
+    arguments.check_not_read(options.out, options.body)
     record = arguments.body_of(options)
     io.write_body(options.out, record)
     low, high = record.vertices.min(axis=0), record.vertices.max(axis=0)

@@ -95,6 +95,7 @@ def fit(options) -> int:
         )
     if check_place(out).is_dir():
         raise InputError("a file expected", field="--out", value=options.out, mend="give another name")
+    arguments.check_not_read(options.out, options.garment, options.body, *filter(None, [options.source]))
     body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
     source = io.read_body(options.source) if options.source else body
     with arguments.as_options():
@@ -137,10 +138,12 @@ def fit(options) -> int:
 
 @contextmanager
 def _drawn(picture: Path, body, placement) -> Iterator[None]:
-    """Draw a garment on the body at its place where what follows refuses it."""
+    """Draw a garment on the body at its place where what follows refuses it; the picture of one that was written stays."""
     try:
         yield
     except InputError:
+        if picture.with_suffix(".npz").exists():
+            picture = picture.with_stem(f"{picture.stem}_refused")
         _draw(picture, body, placement.garment.faces, {"refused": placement.garment.vertices})
         print(f"wrote {picture}: " + ("the place that was given" if placement.given else "the best place that was found"))
         raise

@@ -38,6 +38,7 @@ def simulate(options) -> int:
     from ncs_jax.runs import simulate as runs_simulate
 
     suffix = animation_suffix(options.out, with_body=options.body)  # before hours are spent on frames that cannot be written
+    arguments.check_scene_kept(options.out, scene, *filter(None, [options.motion]))
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
     with WorkProgress("reading the scene") as progress:
 

@@ -145,7 +145,7 @@ def _warn_of_few_steps(run, steps: int | None, mend: str) -> None:
     from ncs_jax.runs.plan import ENOUGH
 
     if steps is None and run.steps < ENOUGH:
-        what = f"only {run.steps} steps fitted in, too few to learn from: what was written shows no trained garment"
+        what = f"only {run.steps} steps were taken, too few to learn from: what was written shows no trained garment"
         print(f"ncs: warning: {what}; {mend}", file=sys.stderr)
 
 

@@ -298,7 +298,7 @@ def find_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> list[
     def make() -> dict[str, np.ndarray]:
         return {"risks": np.frombuffer(json.dumps([astuple(risk) for risk in _looked_for(a, say)]).encode(), np.uint8)}
 
-    files = [asdict(record) for record in (a.garment, *filter(None, (a.body, *a.motions.values())))]
+    files = [asdict(a.garment), *(asdict(record) for record in a.motions.values()), a.body and asdict(a.body)]
     found = required(
         kept(("risks",), make, a.model, asdict(a.prepared), files, tuple(a.motions), str(a.scene.to_dict())), "risks"
     )

@@ -24,10 +24,10 @@ from ncs_jax.prepare.build import Assembly
 from ncs_jax.runs.pose_stiffness import find_stiffness, learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
-from ncs_jax.training.batches import batches, whole_chunks
+from ncs_jax.training.batches import batches, focused, whole_chunks
 from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch
 from ncs_jax.training.loss import with_bodies
-from ncs_jax.training.metrics import diagnose, training_metrics
+from ncs_jax.training.metrics import contact_energies, diagnose, training_metrics
 from ncs_jax.training.programs import Programs
 from ncs_jax.training.step import TrainState, chunk_runner, initial_state, refreshed
 
@@ -35,6 +35,7 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
+FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
 
 class PlacedScene:
@@ -52,6 +53,7 @@ class PlacedScene:
         self._programs, self._chunk, self._metrics = programs or Programs(), *_functions(assembly, self.mesh)
         self._compiled: dict[int, Compiled] = {}
         self._every, self._number = whole_chunks(spec.checkpoint_every), -1  # steps that a share is trained on, and which it is
+        self._weight: np.ndarray | None = None  # of the frames, where some are trained on more
         self.features: MotionFeatures
         self._everywhere: Any  # the model and the features, with bodies
         self._show(0)
@@ -119,6 +121,20 @@ class PlacedScene:
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
+        if step and self.assembly.scene.training.focus and self.model.terms.collision is not None:
+            self._weight = self._contacts(params)
+
+    def _contacts(self, params: dict) -> np.ndarray:
+        """Return what contact costs in every frame that is trained on, J; none of them nothing."""
+        spec, count = self.assembly.scene.training, len(self._last)
+        some = np.unique(np.linspace(0, count - 1, FOCUSED).astype(int))
+        arguments = self.model, params, self.features, self._last[some].astype(np.int32)
+        program = self._programs.ready(
+            "contact", lambda model, *given: contact_energies(model, self.assembly.network, spec.window, *given), *arguments
+        )
+        found = np.asarray(program(*jax.tree.leaves(arguments)), np.float64)
+        found = np.where(np.isfinite(found), found, 0)
+        return np.interp(np.arange(count), some, found + max(found.mean() / 100, 1e-12))
 
     def learn_pose_stiffness(self, params: dict, done: int, steps: int) -> bool:
         """Find how stiff the garment is in poses, after `done` of `steps`: see `runs.pose_stiffness`. Return if it is known."""
@@ -153,6 +169,7 @@ class PlacedScene:
         training, spec = required(self.assembly.training, "training"), self.assembly.scene.training
         if number == self._number or (training.shares is None and self._number >= 0):
             return
+        self._weight = None  # of other frames
         self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
         if training.shares is None:
             self._bare, self._last = self.assembly.track, np.arange(len(self.assembly.track.start))
@@ -167,7 +184,9 @@ class PlacedScene:
         seed, batch = self.seed, self.assembly.scene.training.batch
         if required(self.assembly.training, "training").shares is not None:
             seed, first = int(np.random.SeedSequence([seed, 3, self._number]).generate_state(1)[0]), first % self._every
-        return self._last[batches(len(self._last), batch, seed, first, count)].astype(np.int32)
+        ends = self._last[batches(len(self._last), batch, seed, first, count)].astype(np.int32)
+        share = self.assembly.scene.training.focus
+        return ends if self._weight is None else focused(ends, self._last, self._weight, share, seed, first)
 
     def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
         ends = self._ends(first, count)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-__all__ = ["CHUNK", "batches", "chunks", "whole_chunks"]
+__all__ = ["CHUNK", "batches", "chunks", "focused", "whole_chunks"]
 
 
 CHUNK = 10  # steps in one compiled scan; checkpoints fall on its multiples
@@ -22,6 +22,18 @@ def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.nd
     shuffled = {r: np.random.default_rng([seed, int(r)]).permutation(frames) for r in np.unique(rounds)}
     picked = np.stack([shuffled[r][i] for r, i in zip(rounds, wanted % frames, strict=True)])
     return picked.reshape(count, batch).astype(np.int32)
+
+
+def focused(ends: np.ndarray, last: np.ndarray, weight: np.ndarray, share: float, seed: int, first: int) -> np.ndarray:
+    """Return the last frames of the windows of some steps (count, batch), a share of which are drawn anew by their weight.
+
+    A pure function of its arguments, as `batches`. last, weight: (frames,) all of these frames, and how likely each is.
+    """
+    found, many = ends.copy(), round(share * ends.shape[1])
+    for i, row in enumerate(found):
+        rng = np.random.default_rng([seed, 4, first + i])
+        row[rng.permutation(len(row))[:many]] = rng.choice(last, many, p=weight / weight.sum())
+    return found
 
 
 def whole_chunks(steps: int) -> int:

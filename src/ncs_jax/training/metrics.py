@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.contact.points import with_points
-from ncs_jax.energies.total import distances
+from ncs_jax.energies.total import body_collision, distances
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import edge_strain
 from ncs_jax.geometry.numerics import norm
@@ -21,7 +21,7 @@ from ncs_jax.scene.model import Model, pose_body, pose_garment
 from ncs_jax.training.loss import physics
 from ncs_jax.training.step import Fault
 
-__all__ = ["diagnose", "training_metrics"]
+__all__ = ["contact_energies", "diagnose", "training_metrics"]
 
 
 def training_metrics(
@@ -58,6 +58,21 @@ def training_metrics(
         free = jnp.tensordot(directions, q[-1], (-1, -1), precision="highest")
         found["swung"] = 1000 * jnp.mean(norm(jnp.moveaxis(free, 1, -1)))
     return found
+
+
+def contact_energies(model: Model, network: Method, window: int, params, track: MotionFeatures, ends) -> Float[Array, "frames"]:
+    """Return the energy of collision with the body (12), J, of some frames at alpha = 1."""
+    codes = network.windows(params, track, ends, window, 1)
+    z, q = codes.together(), codes.swung()
+    offsets = decode(network, params, model, z[-1], None if q is None else q[-1])
+    weights, surface = garment_blend(network, params, model), required(model.surface, "surface")
+
+    def one(args):
+        offset, matrices = args
+        x = pose_garment(model, offset, matrices, weights)
+        return body_collision(x, pose_body(model, matrices), surface, model.terms, model.material)
+
+    return lax.map(one, (jnp.moveaxis(offsets, -1, 0), track.matrices[ends]))
 
 
 def diagnose(model: Model, network: Method, params, track: MotionFeatures, fault: Fault) -> str:
