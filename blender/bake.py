@@ -10,6 +10,7 @@ import numpy as np
 from . import commands
 from .export import Names, at_rest, frames_kept, mesh_of, pose_now, read_skeleton, shape_modifiers, write_motion
 from .pose import Wrong, from_metres
+from .process import warnings
 from .tasks import Command
 from .worker import BEGIN, NEXT, Worker
 
@@ -38,7 +39,7 @@ def bake(names: Names, command: list[str], trained: Path):
     scene, skeleton = names.scene_now(), read_skeleton(trained / "skeleton.json")
     first, last = scene.frame_start, scene.frame_end
     count = garment_vertices(names)
-    poses, places, alphas = [], [], []
+    poses, places, alphas, told = [], [], [], ""
     with frames_kept(names):
         for frame in range(first, last + 1):
             names.scene_now().frame_set(frame)
@@ -47,11 +48,11 @@ def bake(names: Names, command: list[str], trained: Path):
             except Wrong as wrong:
                 raise Wrong(f"frame {frame}: {wrong}") from None
             places.append(np.array(names.evaluated("garment").matrix_world))
-            alphas.append(names.scene_now().ncs.alpha)
+            alphas.append(names.scene_now().evaluated_get(names.layer_now().depsgraph).ncs.alpha)
             yield f"reading frame {frame} of {last}"
     if np.ptp(alphas) < 1e-6:
         write_motion(trained / "baked.npz", poses, skeleton, names.fps())
-        yield Command([*command, *commands.animate(alphas[0])], trained, "Neural Cloth: Bake")
+        told = yield Command([*command, *commands.animate(alphas[0])], trained, "Neural Cloth: Bake")
         x = read_pc2(trained / "baked.pc2")
     else:
         with contextlib.closing(Worker(command, trained, skeleton)) as worker:
@@ -69,7 +70,7 @@ def bake(names: Names, command: list[str], trained: Path):
     file = trained / f"baked_{first}_{last}.pc2"
     write_pc2(file, local)
     give_cache(names.of("garment"), file, first)
-    return f"baked frames {first} to {last}: {file}"
+    return "; ".join([f"baked frames {first} to {last}", *warnings(told)])
 
 
 def garment_vertices(names: Names) -> int:

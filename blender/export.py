@@ -264,7 +264,10 @@ def frames_kept(names: Names):
 
 @contextlib.contextmanager
 def playing(names: Names, action):
-    """Let an action alone move the armature, from its rest pose; give all of it back after that."""
+    """Let an action alone move the armature; give all of it back after that.
+
+    Bones without keys stay as they are in the action that the armature has, and are at rest in others.
+    """
     armature = names.of("armature")
     data = armature.animation_data or armature.animation_data_create()
     if data.use_tweak_mode:
@@ -273,7 +276,7 @@ def playing(names: Names, action):
     basis = {bone.name: bone.matrix_basis.copy() for bone in armature.pose.bones}
     data.use_nla = False
     give(data, action, slot if action == before else None)
-    for bone in armature.pose.bones:  # what the action leaves out must not stay from another
+    for bone in armature.pose.bones if action != before else ():
         bone.matrix_basis = Matrix()
     try:
         yield

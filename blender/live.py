@@ -27,9 +27,9 @@ class Live:
         """Start the worker, and show the garment at rest."""
         self.names, self.text = names, "starting"
         self._skeleton = read_skeleton(trained / "skeleton.json")
-        self._worker = Worker(command, trained, self._skeleton)
         self._frame, self._pose, self._alpha = None, None, 0.0
         self.cloth = shown_copy(names)
+        self._worker = Worker(command, trained, self._skeleton)
 
     def ready(self) -> bool:
         """Tell whether the worker has started; show the first frame when it has."""
@@ -48,7 +48,8 @@ class Live:
         The frame after the last one goes on from it, and a gap of a few frames is filled with poses in between. Any other
         frame, and a pose that was changed by hand, has no past: there the cloth is at rest.
         """
-        scene, alpha = self.names.scene_now(), self.names.scene_now().ncs.alpha
+        scene = self.names.scene_now()
+        alpha = scene.evaluated_get(depsgraph).ncs.alpha
         pose = pose_now(self.names.of("armature").evaluated_get(depsgraph), self._skeleton)
         ahead = None if self._frame is None else scene.frame_current - self._frame
         same = self._pose is not None and all(np.abs(a - b).max() < STILL for a, b in zip(pose, self._pose, strict=True))
@@ -130,7 +131,11 @@ def start(names: Names, command: list[str], trained) -> None:
     """
     global current, failure
     stop()
-    current, failure = Live(names, command, trained), ""
+    try:
+        current, failure = Live(names, command, trained), ""
+    except Wrong:
+        remove_copies()
+        raise
     bpy.app.handlers.frame_change_post.append(on_frame)
     bpy.app.handlers.depsgraph_update_post.append(on_change)
     if not bpy.app.background:

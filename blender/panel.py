@@ -12,7 +12,7 @@ from . import commands, live, tasks
 from .bake import bake
 from .export import Names, chosen, export
 from .pose import Wrong
-from .process import find_command, install_commands
+from .process import find_command, install_commands, warnings
 from .tasks import Command
 
 PACKAGE = __package__
@@ -48,6 +48,7 @@ class NCS_Settings(bpy.types.PropertyGroup):
     alpha: FloatProperty(
         name="Alpha", description="How much the garment moves: 0 static, 1 as trained, more exaggerates",
         default=1.0, soft_min=0.0, soft_max=2.0, options={"ANIMATABLE"},
+        update=lambda self, context: self.id_data.update_tag(),  # or Blender would evaluate the last one
     )  # fmt: skip
     folder: StringProperty(
         name="Folder", description="Where files are written; empty: beside the .blend", subtype="DIR_PATH", options=RELATIVE
@@ -171,20 +172,19 @@ def trained(context):
     number = next(n for n in range(1, 10_000) if not (work / f"trained_{n}").exists())
     shutil.copytree(work / "scene", work / f"trained_{number}")
     names.scene_now().ncs.trained = f"trained_{number}"
-    yield Command([*ncs, *commands.train(minutes, False)], work / f"trained_{number}", TRAIN)
-    return f"trained: {work / f'trained_{number}'}"
+    told = yield Command([*ncs, *commands.train(minutes, False)], work / f"trained_{number}", TRAIN)
+    return "; ".join([f"trained_{number}", *warnings(told)])
 
 
 def resumed(context):
     """Go on with the run; yield what is done in between."""
     ncs, folder = needed_command(context), trained_folder(context)
-    yield Command([*ncs, *commands.train(context.scene.ncs.minutes, True)], folder, TRAIN)
-    return f"trained: {folder}"
+    told = yield Command([*ncs, *commands.train(context.scene.ncs.minutes, True)], folder, TRAIN)
+    return "; ".join([folder.name, *warnings(told)])
 
 
 def baked(context):
     """Bake the scene's frames; yield what is done in between."""
-    live.stop()
     ncs, names, folder = needed_command(context), chosen(context), trained_folder(context)
     return (yield from bake(names, ncs, folder))
 
@@ -195,6 +195,7 @@ def installed(context):
     own = own_environment()
     if not bpy.app.online_access and not os.path.exists(source):
         raise Wrong("Blender is offline: allow online access in Preferences > System, or name a file to install")
+    own.parent.mkdir(parents=True, exist_ok=True)
     for line in install_commands(own, source):
         yield f"{own}: {' '.join(line[1:4])}"
         yield Command(line, own.parent, "Neural Cloth: Install")
@@ -215,7 +216,8 @@ class Doing:
     task = None
 
     def execute(self, context):
-        """Begin; without a window, do it all."""
+        """Begin; without a window, do it all. Live ends: it hides the garment, and follows every frame."""
+        live.stop()
         try:
             tasks.start(self.bl_label, type(self).task(context))
         except Wrong as wrong:
@@ -375,6 +377,7 @@ class NCS_PT_panel(bpy.types.Panel):
         row.operator("ncs.bake")
         row.operator("ncs.live", depress=live.current is not None)
         self.draw_state(layout)
+        layout.prop(own, "trained")
         layout.prop(own, "folder")
         if own.folder and not own.folder.startswith("//") and own.folder.startswith(tempfile.gettempdir()):
             layout.label(text="A temporary folder: save the file, then choose another", icon="INFO")

@@ -47,8 +47,8 @@ class Skeleton:
         """
         turned = UP @ (now @ self._back)[:, :3, :3] @ UP.T
         off = np.abs(np.swapaxes(turned, 1, 2) @ turned - np.eye(3)).max(axis=(1, 2))
-        if not off.max() < 2 * GIVE:
-            bone = self.names[int(np.argmax(np.nan_to_num(off, nan=np.inf)))]
+        if (bad := ~(off < 2 * GIVE)).any():
+            bone = self.names[int(np.argmax(bad))]
             raise Wrong(
                 f"bone {bone} changes its size in a pose. Cloth follows bones that turn: remove its scale, and Stretch To"
             )

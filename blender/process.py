@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 STEP = re.compile(r"\bstep (\d+)/(\d+)")
+NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows would show one for each command
 PATIENCE = 20.0  # s that a command has to end by itself, once it is asked to
 
 
@@ -58,11 +59,17 @@ class Process:
         Raises:
             OSError: there is no such program, or the file cannot be written.
         """
-        self.command, self.log, self._asked = command, log, 0.0
+        self.command, self.log, self._asked = command, log, 0.0  # and when it was asked to stop
         with log.open("wb") as stream:
-            own = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {"start_new_session": True}
             self._popen = subprocess.Popen(
-                command, cwd=folder, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=environment(), **own
+                command,
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=stream,
+                env=environment(),
+                start_new_session=os.name != "nt",
+                creationflags=NO_WINDOW,
             )
 
     def running(self) -> bool:
@@ -75,6 +82,11 @@ class Process:
     def code(self) -> int | None:
         """Return the exit code, None while it runs."""
         return self._popen.poll()
+
+    @property
+    def asked(self) -> bool:
+        """Tell whether it was asked to stop."""
+        return self._asked > 0
 
     def text(self) -> str:
         """Return what it has printed so far."""
@@ -100,6 +112,12 @@ def progress(text: str) -> tuple[str, float]:
         if not line.startswith(("total", "strain")):
             return line, -1.0
     return (lines[-1], -1.0) if lines else ("", -1.0)
+
+
+def warnings(text: str) -> list[str]:
+    """Return what a command has warned of: its lines that say so, and motion beyond what the garment was trained on."""
+    found = re.findall(r"^(?:ncs: warning: |  beyond +)(.+(?:\n {14}.+)*)", text, re.MULTILINE)
+    return list(dict.fromkeys(" ".join(words.split()) for words in found))
 
 
 def reason(text: str) -> str:

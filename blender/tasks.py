@@ -12,6 +12,7 @@ from .process import Process, progress, reason
 
 EVERY = 0.2  # s between looks at a command
 SLICE = 0.05  # s of work at once
+WAITS = bpy.app.background  # without a window nothing else is to be done meanwhile
 
 
 class Command:
@@ -45,10 +46,11 @@ class Task:
             self.text, self.share = progress(text)
             if running:
                 return
-            code, self._process = self._process.code, None
+            process, self._process = self._process, None
             show(self._label, text)
-            if code:
-                self._end(reason(text), failed=True)
+            process.log.unlink(missing_ok=True)
+            if process.code:
+                self._end("stopped" if process.asked else reason(text), failed=True)
                 return
             self._go_on(text)
         until = time.monotonic() + SLICE
@@ -121,7 +123,7 @@ def start(name: str, steps: Generator) -> Task:
         raise Wrong(f"{current.name} is under way: wait, or cancel it")
     current = task = Task(name, steps)
     task.begin()
-    while bpy.app.background and not task.over:
+    while WAITS and not task.over:
         task.advance()
         time.sleep(EVERY if task._process is not None else 0)
     if task.failed:

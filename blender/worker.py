@@ -12,7 +12,7 @@ import numpy as np
 
 from . import commands
 from .pose import Skeleton, Wrong
-from .process import environment, reason
+from .process import NO_WINDOW, environment, reason
 
 BEGIN, NEXT, AGAIN = 0, 1, 2  # a frame without a past, the one after the last, the last one once more
 PATIENCE = 10.0  # s to wait for a frame
@@ -31,10 +31,15 @@ class Worker:
         self._skeleton, self._answers, self._facts = skeleton, queue.Queue(), None
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
         pipe = subprocess.PIPE
-        own = {"creationflags": subprocess.CREATE_NO_WINDOW} if hasattr(subprocess, "CREATE_NO_WINDOW") else {}
         try:
             self._popen = subprocess.Popen(
-                [*command, *commands.stream()], cwd=trained, stdin=pipe, stdout=pipe, stderr=self._log, env=environment(), **own
+                [*command, *commands.stream()],
+                cwd=trained,
+                stdin=pipe,
+                stdout=pipe,
+                stderr=self._log,
+                env=environment(),
+                creationflags=NO_WINDOW,
             )
         except OSError as error:
             raise Wrong(f"{command[0]} does not start: {error}") from None

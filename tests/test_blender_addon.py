@@ -194,6 +194,9 @@ def test_progress_is_read_from_what_a_training_prints():
     assert process.progress(stream.getvalue())[1] == -1.0 and process.progress("") == ("", -1.0)
     printed = "step 1/2\nncs: scene.toml: garment.file: no such file\n  a second line\n"
     assert process.reason(printed) == "ncs: scene.toml: garment.file: no such file"
+    warned = "ncs: warning: only 20 steps fitted\n"
+    told = f"{warned}  beyond    in 3 of 24 frames, worst\n              at Spine\n{warned}"
+    assert process.warnings(told) == ["only 20 steps fitted", "in 3 of 24 frames, worst at Spine"]
     assert process.reason("Traceback\nKeyError: 1\n") == "KeyError: 1" and process.reason("")
 
 
@@ -206,7 +209,7 @@ def ended(running: process.Process, seconds: float = 20.0) -> int | None:
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no Ctrl-C for one process")
 def test_a_command_runs_apart_and_stops_as_by_ctrl_c(tmp_path):
-    waits = "import time\nprint('step 3/4', flush=True)\n"
+    waits = "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\nprint('step 3/4', flush=True)\n"
     waits += "try:\n time.sleep(60)\nexcept KeyboardInterrupt:\n print('kept')\n exit(130)"
     running = process.Process([sys.executable, "-c", waits], tmp_path, tmp_path / "log")
     while "step" not in running.text():
@@ -288,27 +291,95 @@ def test_the_command_streams(tmp_path):
 # --- in Blender ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not BLENDER, reason="NCS_BLENDER names no Python with bpy, which needs a NumPy older than ours")
-def test_the_five_actions_in_blender(tmp_path):
-    """Check, Fit, Train, Bake and Live by script, from nothing; baked and live frames are those of `ncs animate`."""
-    ncs = Path(sys.executable).with_name("ncs")
-    user = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
-    (tmp_path / "user").mkdir()
+def fake_wheel(folder: Path) -> None:
+    """A wheel of the package's name, whose command refuses everything."""
+    info, name = "ncs_jax-0.0.1.dist-info", "ncs_jax-0.0.1-py3-none-any.whl"
+    with zipfile.ZipFile(folder / name, "w") as packed:
+        packed.writestr("ncs_fake.py", "import sys\ndef main():\n    sys.exit('ncs: the fake is here')\n")
+        packed.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: ncs-jax\nVersion: 0.0.1\n")
+        packed.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        packed.writestr(f"{info}/entry_points.txt", "[console_scripts]\nncs = ncs_fake:main\n")
+        packed.writestr(f"{info}/RECORD", "")
+
+
+@pytest.fixture(scope="module")
+def in_blender(tmp_path_factory):
+    """What Blender shows after `blender_addon.py`, and the folder."""
+    folder = tmp_path_factory.mktemp("blender")
+    (folder / "user").mkdir()
+    fake_wheel(folder)
     script, assets = ROOT / "tests" / "blender_addon.py", ROOT / "src" / "ncs_jax" / "assets"
-    command = [BLENDER, str(script), str(tmp_path), str(assets), str(pack(tmp_path)), str(ncs)]
+    command = [BLENDER, str(script), str(folder), str(assets), str(pack(folder)), str(Path(sys.executable).with_name("ncs"))]
+    path = os.pathsep.join(p for p in os.environ["PATH"].split(os.pathsep) if not (Path(p) / "ncs").exists())
+    user = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user"), "PATH": path}
     done = subprocess.run(command, env=user, capture_output=True, text=True, check=False)
     assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
-    work = tmp_path / "hero_ncs" / "trained_1"
+    with np.load(folder / "truth.npz") as truth:
+        return folder, dict(truth)
+
+
+needs_blender = pytest.mark.skipif(
+    not BLENDER, reason="NCS_BLENDER names no Python with bpy, which needs a NumPy older than ours"
+)
+
+
+@pytest.mark.slow
+@needs_blender
+def test_baked_and_live_frames_are_those_of_animate(in_blender):
+    """Check, Fit, Train, Resume, Bake and Live by script, from nothing, in half metres."""
+    folder, truth = in_blender
+    work = folder / "hero_ncs" / "trained_1"
     run = load_run(work / "run")
-    motion = run.motion(str(work / "baked.npz"))
-    expected = run.animate(motion, 1.25)
-    with np.load(tmp_path / "truth.npz") as truth:
-        np.testing.assert_allclose(truth["baked"], expected, rtol=0, atol=1e-4)
-        np.testing.assert_allclose(truth["live"], expected, rtol=0, atol=1e-4)
-        assert truth["hidden"] and truth["gone"]
-        assert truth["modifiers"].tolist() == ["WELD", "MESH_CACHE", "SUBSURF"]
-        assert {f"Neural Cloth: {what}" for what in ("Check", "Fit", "Train", "Bake")} <= set(truth["texts"].tolist())
-        assert {"check.png", "fitted.png"} <= set(truth["images"].tolist())
-    assert np.ptp(expected, axis=0).max() > 0.1
-    assert set(load_scene(work / "scene.toml").motion.files) == {"motions/Armature_mixamo.com_Layer0.npz", "motions/Turn.npz"}
+    first = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 1.25)
+    second = run.animate(run.motion(str(work / "motions" / "Turn.npz")), 1.25)
+    assert min(np.ptp(x, axis=0).max() for x in (first, second)) > 0.1 and np.abs(first - second).max() > 0.1
+    np.testing.assert_allclose(truth["baked"], second, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(truth["live"], second, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(truth["other"], first, rtol=0, atol=1e-4)
+    static = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 0.0)
+    np.testing.assert_allclose(truth["static"], static[-1], rtol=0, atol=1e-4)
+    assert 0.01 < np.abs(truth["by_hand"] - truth["static"]).max() < 1.0
+    assert float(truth["ms"]) < 1000 / 24
+    assert truth["modifiers"].tolist() == ["WELD", "MESH_CACHE", "SUBSURF"] and truth["hidden"] and truth["gone"]
+
+
+@pytest.mark.slow
+@needs_blender
+def test_alpha_has_keys(in_blender):
+    folder, truth = in_blender
+    run = load_run(folder / "hero_ncs" / "trained_1" / "run")
+    motion = str(folder / "hero_ncs" / "trained_1" / "motions" / "Armature_mixamo.com_Layer0.npz")
+    np.testing.assert_allclose(truth["keyed_baked"], truth["keyed_live"], rtol=0, atol=1e-6)
+    for frame, alpha in ((0, 0.0), (-1, 2.0)):
+        np.testing.assert_allclose(
+            truth["keyed_baked"][frame], run.animate(run.motion(motion), alpha)[frame], rtol=0, atol=1e-4
+        )
+    assert np.abs(truth["keyed_baked"] - truth["other"]).max() > 1e-4
+
+
+@pytest.mark.slow
+@needs_blender
+def test_blender_stays_free_and_a_training_is_cancelled(in_blender):
+    _, truth = in_blender
+    assert float(truth["check_tick"]) < 2 and str(truth["check_said"]).startswith("good")
+    assert float(truth["train_tick"]) < 2 and str(truth["train_said"]) == "stopped"
+
+
+@pytest.mark.slow
+@needs_blender
+def test_what_is_wrong_is_said(in_blender):
+    folder, truth = in_blender
+    said = json.loads(str(truth["refusals"]))
+    assert (
+        "Choose a character" in said["nothing"]
+        and "Preserve Volume" in said["volume"]
+        and "no vertex group waist" in said["pins"]
+    )
+    assert said["untrained"].count("Train first") == 2 and "bone mixamorig:Spine changes its size" in said["scale"]
+    assert all(word in str(truth["drawn"]) for word in ("Garment", "Train", "Live", "Alpha", "Train: stopped", "Found: "))
+    assert "ncs is not on PATH" in str(truth["lost"]) and "the fake is here" in str(truth["installed"])
+    assert {f"Neural Cloth: {what}" for what in ("Check", "Fit", "Train", "Bake")} <= set(truth["texts"].tolist())
+    assert {"check.png", "fitted.png"} <= set(truth["images"].tolist())
+    scene = load_scene(folder / "hero_ncs" / "trained_1" / "scene.toml")
+    assert set(scene.motion.files) == {"motions/Armature_mixamo.com_Layer0.npz", "motions/Turn.npz"}
+    assert scene.garment.file == "fitted.npz" and scene.motion.fps == 30
