@@ -41,7 +41,8 @@ class NCS_Settings(bpy.types.PropertyGroup):
     pins: StringProperty(name="Pins", description="Vertex group of the garment that is held to the body, as a waistband")
     actions: CollectionProperty(type=NCS_Action)
     chosen: IntProperty(name="Chosen action")
-    find_place: BoolProperty(name="Find its place", description="Let Fit look for the garment's place")
+    find_place: BoolProperty(name="Find its place", description="Let Fit look for the garment's unit, axes and place")
+    options: StringProperty(name="Options", description="Options of ncs fit that say where it is, as it prints them")
     minutes: FloatProperty(
         name="Minutes", description="How long to train, from the first step on", default=10, min=0.05, soft_max=240
     )
@@ -123,14 +124,20 @@ def work_folder(context) -> Path:
 
 
 def actions_of(context, names: Names) -> list[str]:
-    """Return the names of the actions to train on: those listed, else the armature's own."""
+    """Return the names of the actions to train on: those listed, else the armature's own, if it has one."""
     listed = [entry.action.name for entry in context.scene.ncs.actions if entry.action]
     data = names.of("armature").animation_data
     if not listed and data is not None and data.action is not None:
         listed = [data.action.name]
-    if not listed:
-        raise Wrong(f"{names.armature} has no action: give it one, or add some in the panel")
     return list(dict.fromkeys(listed))
+
+
+def needed_actions(context, names: Names) -> list[str]:
+    """Return the names of the actions to train on, of which there must be one."""
+    found = actions_of(context, names)
+    if not found:
+        raise Wrong(f"{names.armature} has no action: give it one, or add some in the panel")
+    return found
 
 
 def trained_folder(context) -> Path:
@@ -144,7 +151,7 @@ def trained_folder(context) -> Path:
 def checked(context):
     """Check the scene, and show the picture; yield what is done in between."""
     ncs, names, folder = needed_command(context), chosen(context), work_folder(context) / "scene"
-    yield from export(names, folder, context.scene.ncs.pins, actions_of(context, names))
+    yield from export(names, folder, context.scene.ncs.pins, needed_actions(context, names))
     text = yield Command([*ncs, *commands.check()], folder, "Neural Cloth: Check")
     picture(folder / "check.png")
     risks = text.count("  at risk ")
@@ -155,12 +162,14 @@ def fitted(context):
     """Fit the garment: out of the skin, with the contact that keeps it so; yield what is done in between."""
     ncs, names, folder = needed_command(context), chosen(context), work_folder(context) / "scene"
     own, actions = context.scene.ncs, actions_of(context, names)
-    line = [*ncs, *commands.fit(own.find_place)]
+    line = [*ncs, *commands.fit(own.find_place, own.options if own.find_place else "")]
     yield from export(names, folder, own.pins, actions)
     for old in folder.glob("fitted.*"):
         old.unlink()
-    yield Command(line, folder, "Neural Cloth: Fit")
-    picture(folder / "fitted.png")
+    try:
+        yield Command(line, folder, "Neural Cloth: Fit")
+    finally:  # it is drawn too where the place is refused
+        picture(folder / "fitted.png")
     return "fitted; look at the picture fitted.png"
 
 
@@ -168,7 +177,7 @@ def trained(context):
     """Train a new run; yield what is done in between."""
     ncs, names, work = needed_command(context), chosen(context), work_folder(context)
     own, minutes = context.scene.ncs, context.scene.ncs.minutes
-    yield from export(names, work / "scene", own.pins, actions_of(context, names))
+    yield from export(names, work / "scene", own.pins, needed_actions(context, names))
     number = next(n for n in range(1, 10_000) if not (work / f"trained_{n}").exists())
     shutil.copytree(work / "scene", work / f"trained_{number}")
     names.scene_now().ncs.trained = f"trained_{number}"
@@ -367,6 +376,8 @@ class NCS_PT_panel(bpy.types.Panel):
         row = column.row(align=True)
         row.operator("ncs.fit")
         row.prop(own, "find_place", toggle=True)
+        if own.find_place:
+            column.prop(own, "options")
         row = column.row(align=True)
         row.operator("ncs.train")
         row.operator("ncs.resume")

@@ -161,7 +161,13 @@ def test_every_action_has_a_file_name():
 
 
 def test_the_command_lines_are_accepted():
-    lines = [commands.check(), commands.fit(True), commands.fit(False), commands.train(0.05, False), commands.train(10, True)]
+    lines = [
+        commands.check(),
+        commands.fit(True, "--scale 0.0254 --up=-z --move 0 1 -2"),
+        commands.fit(False),
+        commands.train(0.05, False),
+        commands.train(10, True),
+    ]
     for line in [*lines, commands.animate(1 / 3), commands.animate(-1.5e-7), commands.stream()]:
         assert not refused(main, line), line
 
