@@ -137,6 +137,8 @@ def _tick() -> float | None:
     """Go on with the task, and draw the panel again; Blender's timer calls it."""
     if current is None:
         return None
+    if bpy.app.is_job_running("RENDER"):  # another frame now would be in the picture
+        return EVERY
     current.advance()
     redraw()
     return None if current.over else EVERY if current._process is not None else 0.01

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from blender import commands, pose, process, scene_file
 from ncs_jax.cli import main
+from ncs_jax.cli.check import tell
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.geometry.skinning import Skeleton, forward
 from ncs_jax.runs.run import Run, load_run
@@ -189,7 +190,7 @@ def test_the_command_is_found_where_it_is(tmp_path, monkeypatch):
     assert make[0] == sys.executable and make[1:3] == ["-m", "venv"] and install[-1] == "ncs-jax"
 
 
-def test_progress_is_read_from_what_a_training_prints():
+def test_progress_is_read_from_what_a_training_prints(capsys):
     stream = io.StringIO()
     with WorkProgress("reading the scene", console=Console(file=stream)) as told:
         assert process.progress(stream.getvalue()) == ("reading the scene ...", -1.0)
@@ -201,8 +202,10 @@ def test_progress_is_read_from_what_a_training_prints():
     printed = "step 1/2\nncs: scene.toml: garment.file: no such file\n  a second line\n"
     assert process.reason(printed) == "ncs: scene.toml: garment.file: no such file"
     warned = "ncs: warning: only 20 steps fitted\n"
-    told = f"{warned}  beyond    in 3 of 24 frames, worst\n              at Spine\n{warned}"
-    assert process.warnings(told) == ["only 20 steps fitted", "in 3 of 24 frames, worst at Spine"]
+    tell("note", "nothing")
+    tell("beyond", words := "in 3 of 24 frames, the worst of which is at the joint Spine" + " and so on" * 20)
+    told = f"{warned}{capsys.readouterr().out}{warned}"
+    assert process.warnings(told) == ["only 20 steps fitted", words] and told.count("\n") > 4
     assert process.reason("Traceback\nKeyError: 1\n") == "KeyError: 1" and process.reason("")
 
 
