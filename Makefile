@@ -11,7 +11,7 @@ $(PYTHON) -m venv .venv
 { $(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python $(PINNED) --editable '$1'; } || $(PIP) --editable '$1'
 endef
 
-.PHONY: demo test test-all thorough bench study stability docs lint format assets clean
+.PHONY: demo test test-all thorough bench study stability docs blender lint format assets clean
 
 demo: .venv/installed
 	$(BIN)/ncs demo --out runs/demo
@@ -51,6 +51,10 @@ stability: .venv/installed
 # The documentation, into build/site. Warnings are errors.
 docs: .venv/ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build  # with --quiet it would neither show warnings nor fail on them
+
+# The add-on as a zip for Blender's Preferences > Get Extensions > Install from Disk. Any Python 3.11 will do, and no network.
+blender:
+	$(PYTHON) tools/pack_blender.py build
 
 lint: .venv/ready
 	$(BIN)/ruff check .

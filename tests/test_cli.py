@@ -311,7 +311,7 @@ def test_hosts_that_cannot_be_joined(capsys):
     one_line(capsys, ["--hosts", "in use", "free port"])
 
 
-COMMANDS = ("demo", "train", "preview", "animate", "export", "simulate", "evaluate", "view", "body", "fit", "check")
+COMMANDS = ("demo", "train", "preview", "animate", "export", "stream", "simulate", "evaluate", "view", "body", "fit", "check")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -28,6 +28,7 @@ STEPS = "3"
 RUNS = ("RUN", "runs/demo", "runs/tshirt", "runs/skirt", "runs/shirt")
 BENCHMARK = "experiments/benchmark.toml"
 NAMES = {"SCENE": "ncs:tshirt", "GARMENT": "shirt.obj", "BODY": "character.glb", "FILE": "walk.npz", BENCHMARK: "ncs:tshirt"}
+ELSEWHERE = ("--hosts", "--format web", "hero_ncs", "blender_addon")  # other machines, a package of npm, Blender
 SHORT = """[garment]
 file = "ncs:skirt"
 pins = "pins"
@@ -155,7 +156,7 @@ def _run_python(sample: Sample, names: dict) -> str:
 
 
 def _run_command(sample: Sample, experiments: bool) -> str | None:
-    elsewhere = "--hosts" in sample.text or "--format web" in sample.text  # other machines, or a package of npm
+    elsewhere = any(word in sample.text for word in ELSEWHERE)
     if sample.text.startswith(("srun", "CUDA_VISIBLE_DEVICES")) or elsewhere:
         return None
     words = [NAMES.get(word, word) for word in next(iter(written_out(sample.text)))]
@@ -169,7 +170,7 @@ def _run_command(sample: Sample, experiments: bool) -> str | None:
         return None if tested else _module(rest[1:])
     if program == "python":
         return _shell([sys.executable, *rest])
-    if program != "ncs" or not rest or "--help" in rest or rest == ["check"]:  # which is not complete
+    if program != "ncs" or not rest or "--help" in rest or rest == ["check"] or rest[0] == "stream":  # which is not complete
         return None
     return _viewed(rest) if rest[0] == "view" else _ncs(rest)
 

@@ -1,4 +1,4 @@
-"""The command line: ncs demo, train, preview, animate, export, simulate, evaluate, view, body, fit, check."""
+"""The command line: ncs demo, train, preview, animate, export, stream, simulate, evaluate, view, body, fit, check."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import warnings
 from importlib.metadata import version
 from pathlib import Path
 
-from ncs_jax.cli import animate, body, check, evaluate, fit, preview, simulate, train, view
+from ncs_jax.cli import animate, body, check, evaluate, fit, preview, simulate, stream, train, view
 from ncs_jax.errors import InputError, InputWarning
 
 __all__ = ["main", "quieten_jaxlib"]
@@ -25,6 +25,7 @@ Neural cloth simulation: a garment learns to move on an animated character from 
   ncs preview RUN                   draw it again: a picture, a page that plays it, a GIF
   ncs animate RUN --out FILE        animate a trained garment
   ncs export RUN --out FILE         write its step for engines and hosts, as ONNX or StableHLO, or a page that runs it
+  ncs stream RUN                    answer poses with vertices, frame by frame, for another program such as Blender
   ncs simulate SCENE --out FILE     animate it without a network, by minimising the same energy frame by frame
   ncs evaluate RUN                  strain, penetration, energies in physical units
   ncs view RUN|FILE|SCENE           look at it in a browser: play, scrub, orbit, alpha, colours
@@ -85,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ncs", description=DESCRIPTION, formatter_class=raw)
     parser.add_argument("--version", action="version", version=f"ncs-jax {version('ncs-jax')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (train, preview, animate, simulate, evaluate, body, fit, view, check):
+    for group in (train, preview, animate, stream, simulate, evaluate, body, fit, view, check):
         group.add_commands(commands)
     return parser
 
