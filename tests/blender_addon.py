@@ -13,6 +13,7 @@ import time
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import bpy
 import numpy as np
@@ -278,7 +279,7 @@ def main(folder: Path, assets: Path, packed: str, command: str) -> None:
         skin, armature = character(dict(body))
         garment = dress(dict(file))
     actions(armature)
-    scene, found = bpy.context.scene, {}
+    scene, found = bpy.context.scene, dict[str, Any]()
     scene.render.fps, scene.frame_start, scene.frame_end, scene.unit_settings.scale_length = 30, FIRST, LAST, UNIT
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "hero.blend"))
     (work := folder / "hero_ncs").mkdir()

@@ -147,12 +147,13 @@ def test_a_scene_file_is_one_of_the_package(tmp_path):
         '[body]\nfile = "x"\n[garment]\nfile = "fitted.npz"\n[motion]\nfiles = []\n[physics.collision]\nthickness = 0.006\n'
     )
     (tmp_path / "scene" / "fitted.toml").write_text(fitted)
-    own.write_text("[physics]\ndensity = 0.3\n[physics.collision]\nstiffness = 20\n[training]\nsteps = 7\n")
+    own.write_text("[physics]\ndensity = 0.3\n[physics.collision]\nstiffness = 20\n[training]\nsteps = 7\nwindow = 9\n")
     scene_file.write_scene(tmp_path / "scene", False, ["motions/a.npz"], 30.0, own)
     scene = load_scene(tmp_path / "scene" / "scene.toml")
     assert (scene.garment.file, scene.body.file, scene.motion.files) == ("fitted.npz", "body.npz", ("motions/a.npz",))
     collision = scene.physics.collision
     assert (collision.thickness, collision.stiffness, scene.physics.density, scene.training.steps) == (0.006, 20, 0.3, 7)
+    assert scene.training.window == 9
 
 
 def test_every_action_has_a_file_name():
@@ -265,13 +266,15 @@ def test_frames_in_a_row_are_those_of_animate(method):
     whole, count = run.animate(motion, 1.5), len(motion.poses)
     kinds = [BEGIN, *[NEXT] * (count - 1)]
     np.testing.assert_allclose(answers(run, frames(motion, kinds, [1.5] * count)), whole, rtol=0, atol=1e-5)
-    kinds[9], kinds[12] = BEGIN, AGAIN
-    alphas = [1.5] * 12 + [0.0] + [1.5] * (count - 13)
-    other = answers(run, frames(motion, kinds, alphas))
-    np.testing.assert_allclose(other[:9], whole[:9], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(other[9], run.animate(motion, 0.0)[9], rtol=0, atol=1e-5)  # without a past
-    np.testing.assert_allclose(other[12], run.animate(motion, 0.0)[12], rtol=0, atol=1e-5)
-    assert np.abs(other[10] - whole[10]).max() > 1e-4
+    asked = frames(motion, kinds, [1.5] * count)
+    others = (AGAIN, 0.0), (AGAIN, 1.5), (BEGIN, 1.5)
+    static, again, anew = (frames(motion, [kind] * count, [alpha] * count) for kind, alpha in others)
+    other = answers(run, [*asked[:9], static[8], again[8], *asked[9:12], anew[12], *asked[13:]])
+    np.testing.assert_allclose(other[9], run.animate(motion, 0.0)[8], rtol=0, atol=1e-5)
+    kept = [*range(8), 10, 11, 12, 13]  # 8 and 9 were taken back
+    np.testing.assert_allclose(other[kept], whole[:12], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(other[14], run.animate(motion, 0.0)[12], rtol=0, atol=1e-5)  # without a past
+    assert np.abs(other[15] - whole[13]).max() > 1e-4
 
 
 @pytest.mark.slow
