@@ -89,7 +89,8 @@ def frame_inputs(
         model: of a scene, such as `assembly.model`.
         track: a motion, `assembly.track` or `run.track(name)`. Positions are seen from its origin: `track.relative(x)`.
         frame: which of the track's.
-        previous: the garment in the frame before, x_{t-1}, m; needed with inertia or friction.
+        previous: the garment in the frame before, x_{t-1}, m; needed with inertia or friction. It and `before` are constants to
+            the derivative of the energies, unless the model's `terms.through_time`: a gradient through frames needs that.
         before: the garment two frames before, x_{t-2}, m; else that of the frame before, a garment that was at rest.
 
     Raises:
