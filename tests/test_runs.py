@@ -269,7 +269,9 @@ def test_minutes_that_were_measured_wrongly_are_planned_anew(tmp_path, plain_jax
     """A step of this scene takes some 15 ms."""
     scene, seen, out = write_scene(tmp_path, FREE), [], tmp_path / "run"
     measure = runs_train.measure_costs
-    monkeypatch.setattr(runs_train, "measure_costs", lambda *a: measure(*a)._replace(step=step, checkpoint=0, lists=0))
+    monkeypatch.setattr(
+        runs_train, "measure_costs", lambda *a, **k: measure(*a, **k)._replace(step=step, checkpoint=0, lists=0)
+    )
     run = train(scene, out, minutes=0.05, report=seen.append)
     first, last = seen[0].steps, seen[-1].steps
     assert (last > 1.3 * first) if step > 0.05 else (last < 0.8 * first)

@@ -16,7 +16,7 @@ from ncs_jax.energies.terms import StepInputs, Terms
 from ncs_jax.energies.total import total
 from ncs_jax.geometry.skinning import blend, skin, unpose
 from ncs_jax.network.methods.method import decode
-from ncs_jax.network.methods.swing import QUIET, Swing, stiffness
+from ncs_jax.network.methods.swing import FEW, QUIET, Swing, _product, stiffness
 from ncs_jax.network.rollout import stepper
 from ncs_jax.prepare.build import BEYOND, features_from_records
 from ncs_jax.prepare.setting import with_cell
@@ -245,6 +245,12 @@ def test_alpha_scales_the_swing_and_the_code_that_goes_with_it():
     np.testing.assert_array_equal(codes.swung(3.0), 3.0 * codes.swing)
     moved = [np.abs(run(assembly, params, motion, alpha) - run(assembly, params, motion, 0.0)).max() for alpha in (1.0, 2.0)]
     assert moved[1] > 1.3 * moved[0] > 1e-3
+
+
+def test_the_mass_of_many_poses_is_that_of_each(rng):
+    directions, mass, transforms = (rng.standard_normal(size) for size in ((5, 3, 4), 5, (5, 3, 4, FEW)))
+    each = [_product(directions, mass, transforms[..., k : k + 1])[..., 0] for k in range(FEW)]
+    np.testing.assert_allclose(_product(directions, mass, transforms), np.stack(each, axis=-1), rtol=1e-11, atol=1e-12)
 
 
 def test_far_from_the_origin_a_stream_in_single_precision_swings_as_near_it():

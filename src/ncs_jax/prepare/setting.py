@@ -6,7 +6,7 @@ That is all that a check needs. `build` adds what moves: features of the motions
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import jax
@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.prepare.constants import model_from
 from ncs_jax.prepare.garment_checks import check_on_body
+from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import load_motions
 from ncs_jax.prepare.moving_body import check_character, moving_body
 from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
@@ -68,11 +69,24 @@ def set_up(
         scene, motions = load_motions(scene, files.body, say)
         files = replace(files, scene=scene)
         say("preparing the garment")
-        prepared = replace(prepare_scene(files, [motions[name] for name in scene.motion.files]), betas=betas)
+        prepared = replace(_prepared(files, [motions[name] for name in scene.motion.files]), betas=betas)
     model = model_from(files, prepared, dtype)
     automatic = scene.network.cell == "auto"
     scene = cell_of(with_cell(scene), not model.moves or model.terms.pinning or model.body is not None, automatic)
     return Setting(scene, prepared, model, files.body, files.garment, motions)
+
+
+def _prepared(files: SceneFiles, motions: list[io.MotionRecord]) -> Prepared:
+    """Return `prepare_scene`, kept from before; not over other garments, whose networks tell."""
+
+    def make() -> dict[str, np.ndarray]:
+        return {name: np.asarray(array) for name, array in vars(prepare_scene(files, motions)).items()}
+
+    if files.layers:
+        return prepare_scene(files, motions)
+    records = [vars(record) for record in (files.garment, files.body, *motions) if record is not None]
+    found = kept(tuple(f.name for f in fields(Prepared)), make, records, files.mesh, files.pins, str(files.scene.to_dict()))
+    return Prepared(**required(found, "prepared"))
 
 
 def with_cell(scene: Scene) -> Scene:

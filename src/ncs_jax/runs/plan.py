@@ -77,11 +77,14 @@ def steps_within(seconds: float, costs: Costs, first: int = 0) -> int:
     return lasts[max(0, bisect_right(lasts, seconds, key=lambda last: costs.seconds(first, last)) - 1)]
 
 
-def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[], object] | None, checkpoint: float) -> Costs:
+def measure_costs(
+    placed: PlacedScene, state: TrainState, validate: Callable[[], object] | None, checkpoint: float, *, stiffness: bool
+) -> Costs:
     """Return what training takes from a state on; every program that it needs is compiled then.
 
     Args:
-        state: to train from. validate: does what a validation does. checkpoint: how long one takes, s.
+        state: to train from. validate: does what a validation does. checkpoint: how long one takes, s. stiffness: whether the
+            stiffness in poses is looked for.
     """
     spec = placed.assembly.scene.training
 
@@ -108,7 +111,7 @@ def measure_costs(placed: PlacedScene, state: TrainState, validate: Callable[[],
         step = _seconds(chunk)
     validation = 0.0 if validate is None else _seconds(compiled(validate))
     every = whole_chunks(spec.validate_every), whole_chunks(spec.checkpoint_every)
-    pose = _seconds(compiled(lambda: placed.find_stiffness(state.params)))
+    pose = _seconds(compiled(lambda: placed.find_stiffness(state.params))) if stiffness else 0.0
     return Costs(step / CHUNK, validation, checkpoint, relisted, *every, pose)
 
 

@@ -140,7 +140,7 @@ def train_assembly(
         if begun.params is not None and begun.facts is None:
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
-        last, timed = _planned(placed, output, state, steps, minutes)
+        last, timed = _planned(placed, output, state, length, stiffness=settle is None)
         trained = output.keep_motion()
         return _Loop(placed, output, placed.copied(state), last, begun.since, settle).run(trained, timed)
 
@@ -154,14 +154,18 @@ def _check_options(steps: int | None, minutes: float | None, resume: bool, start
 
 
 def _planned(
-    placed: PlacedScene, output: _Output, state: TrainState, steps: int | None, minutes: float | None
+    placed: PlacedScene, output: _Output, state: TrainState, length: tuple[int | None, float | None], *, stiffness: bool
 ) -> tuple[int, Minutes | None]:
-    """Return at which step a run ends that stands at a state, and by what time if by time, and write it into run.json."""
+    """Return at which step a run ends that stands at a state, and by what time if by time, and write it into run.json.
+
+    length, stiffness: see `train_assembly`, `measure_costs`.
+    """
+    steps, minutes = length
     last, timed = steps or output.planned or placed.assembly.scene.training.steps, None
     if minutes is not None:
         assembly = placed.assembly
         validate = functools.partial(_validate, Run(assembly, state.params)) if assembly.scene.motion.validation else None
-        costs = measure_costs(placed, state, validate, output.seconds_of_a_checkpoint(state))
+        costs = measure_costs(placed, state, validate, output.seconds_of_a_checkpoint(state), stiffness=stiffness)
         timed = Minutes(costs, int(state.step), 60 * minutes)
         last = int(placed.copied(steps_within(timed.seconds, costs, timed.first)))
         if last < ENOUGH and not output.started and jax.process_index() == 0:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ncs_jax.energies.terms import StepInputs
 from ncs_jax.errors import required
 from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
@@ -52,11 +53,17 @@ def _couplings(model: Model) -> Couplings:
 
 def _still(model: Model, couplings: Couplings, matrices: Array) -> tuple[Problem, Array]:
     """The garment in a pose, seen from the root joint, which no past moves; and its skinning transforms."""
-    matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
     model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
-    transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
-    step = step_inputs(model, matrices, Past(rest, rest, moving=jnp.zeros((), rest.dtype)), transforms=transforms)
+    step, transforms = _posed(model, matrices)
     return Problem(model, couplings, None, step), transforms
+
+
+@jax.jit
+def _posed(model: Model, matrices: Array) -> tuple[StepInputs, Array]:
+    matrices = matrices.at[:, :, 3].add(-matrices[0, :, 3])
+    transforms, rest = blend(matrices, model.blend), model.garment.mesh.rest
+    past = Past(rest, rest, moving=jnp.zeros((), rest.dtype))
+    return step_inputs(model, matrices, past, transforms=transforms), transforms
 
 
 @jax.jit
@@ -89,7 +96,7 @@ def _longest(problem: Problem, point, p):
     return jnp.min(share_outside_body(problem, point.contact, p))
 
 
-_accepted = jax.jit(accepts)
+_accepted, _least_step, _skin, _unpose = (jax.jit(f) for f in (accepts, static_step, skin, unpose))
 
 
 def _matrix(problem: Problem, diagonal, off):
@@ -108,7 +115,7 @@ def _stiff(problem: Problem, blocks, mass):
     """The stiffness of a place, sparse, without the mass that `stiffness_blocks` adds."""
     from scipy.sparse import diags
 
-    added = mass / max(1 / problem.model.fps, float(static_step(problem.model))) ** 2
+    added = mass / max(1 / problem.model.fps, float(_least_step(problem.model))) ** 2
     return _matrix(problem, *(np.asarray(block, np.float64) for block in blocks)) - diags(np.repeat(added, 3))
 
 
@@ -132,7 +139,7 @@ class _Place(NamedTuple):
 
 def _place(problem: Problem, x, held=None, at=None) -> _Place:
     held, at = jnp.zeros((*x.shape, 3), x.dtype) if held is None else held, x if at is None else at
-    here, point, blocks = _evaluated(problem, x, held, at)
+    here, point, blocks = _evaluated(replace(problem, neighbours=None), x, held, at)
     return _Place(x, here, point, blocks, held, at)
 
 
@@ -159,17 +166,17 @@ def _along(place: _Place, p) -> tuple[_Place | None, float, float]:
 
 def _walked(model: Model, matrices, mass, still: Callable) -> Array:
     """The garment in unposed space (verts, 3) that has followed the body from rest into a pose, but is not yet still there."""
-    unposed, h = model.garment.mesh.rest, float(static_step(model))
+    unposed, h = model.garment.mesh.rest, float(_least_step(model))
     for k, pose in enumerate(walk_in(model, matrices)):
         problem, transforms = still(pose)
-        place = _place(problem, skin(transforms, unposed))
+        place = _place(problem, _skin(transforms, unposed))
         for _ in range(SETTLE if k else FALL):
             _, p = _newton(place, mass, h)
             reached, _, _ = _along(place, p)
             if reached is None:
                 break
             place = reached
-        unposed = unpose(transforms, place.x)
+        unposed = _unpose(transforms, place.x)
     return unposed
 
 
@@ -180,7 +187,7 @@ def _drape(problem: Problem, x, mass):
     near, and those ways are no vibrations. So what touches the body after `FREE` steps is held there along the body, as
     friction holds it: see `_sticking`. Newton's method then converges. A mass over h^2 damps it, the less the farther it gets.
     """
-    least = h = float(static_step(problem.model))
+    least = h = float(_least_step(problem.model))
     place = _place(problem, x)
     for count in range(STEPS):
         if count == FREE:
@@ -231,7 +238,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
-    worn, led = (skin(transforms, x) for x in (mesh.rest, _walked(model, track.matrices[0], mass, still)))
+    worn, led = (_skin(transforms, x) for x in (mesh.rest, _walked(model, track.matrices[0], mass, still)))
     drape = _drape(problem, led, mass)
     if drape is None:
         return None
@@ -248,7 +255,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     )
     slopes = displacement_slopes(mesh, directions)
     found = (jnp.asarray(array, model.basis.dtype) for array in (directions, energy, slopes))
-    return RitzModes(*found, drape=unpose(transforms, x) - unpose(transforms, worn))  # zeros where a blend is singular
+    return RitzModes(*found, drape=_unpose(transforms, x) - _unpose(transforms, worn))  # zeros where a blend is singular
 
 
 def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarray:
@@ -266,7 +273,7 @@ def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarr
     from scipy.sparse import diags
 
     problem, transforms = _still(model, _couplings(model), matrices)
-    x = skin(transforms, model.garment.mesh.rest + offsets)
+    x = _skin(transforms, model.garment.mesh.rest + offsets)
     free = jnp.zeros((*x.shape, 3), x.dtype)
     _, point, (diagonal, off) = _evaluated(problem, x, free, x)
     mass = np.asarray(problem.mass, np.float64)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ncs_jax.geometry.skinning import forward, transforms
+from ncs_jax.geometry.skinning import Skeleton, forward, transforms
 from ncs_jax.scene.model import Model
 
 __all__ = ["FALL", "SETTLE", "walk_in"]
@@ -40,6 +40,10 @@ def walk_in(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, 
     rotations = Rotation.from_rotvec((shares * turn).reshape(-1, 3)).as_matrix().reshape(-1, len(parents), 3, 3)
     root, rest = np.argmin(parents), np.asarray(skeleton.joints, np.float64)
     moved = world[root] @ rest[root] + np.asarray(matrices, np.float64)[root, :, 3] - rest[root]
-    dtype = matrices.dtype
-    way = jnp.broadcast_to(jnp.asarray(moved, dtype), (len(rotations), 3))
-    return transforms(skeleton, forward(skeleton, jnp.asarray(rotations, dtype), way))
+    dtype = np.dtype(matrices.dtype)
+    return _moved(skeleton, rotations.astype(dtype), np.tile(moved.astype(dtype), (len(rotations), 1)))
+
+
+@jax.jit
+def _moved(skeleton: Skeleton, rotations: Array, translation: Array) -> Array:
+    return transforms(skeleton, forward(skeleton, rotations, translation))

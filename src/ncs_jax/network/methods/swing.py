@@ -52,7 +52,7 @@ from ncs_jax.scene.model import Model, RitzModes, pose_garment
 __all__ = ["Swing", "as_about_the_drape", "stiffness"]
 
 BLOCK = 32  # frames whose statics are posed together
-FEW = 8  # poses of which sums are faster as a product of matrices: ten times of one, but half as fast of 32
+FEW = 8  # poses of which the mass is faster by the directions in each
 QUIET = 0.02  # of a track's largest swing: a smaller one is not enlarged that far
 
 _matmul = partial(jnp.matmul, precision="highest")
@@ -110,12 +110,16 @@ class Swing:
         state, matrices = state.reshape(-1, self.state).T, jnp.moveaxis(matrices.reshape(-1, *matrices.shape[-3:]), 0, -1)
         earlier, root, q, started = jnp.split(state, np.cumsum([6 * self.verts, 3, self.modes]))
         now = matrices[0, :, 3]
-        s, p = self._static_garment(params, model, fixed.reshape(-1, fixed.shape[-1]), matrices.at[:, :, 3].add(-now[None]))
+        matrices, weights = matrices.at[:, :, 3].add(-now[None]), garment_blend(self, params, model)
+        s = pose_garment(model, decode(self, params, model, fixed.reshape(-1, fixed.shape[-1])), matrices, weights)
         previous, before = jnp.where(started[None, None] > 0, earlier.reshape(2, *s.shape) + (root - now)[None, None], s[None])
-        g, push = _product(model, p, p), _push(model, p, s - 2 * previous + before)
+        d, transforms = _vibrations(model).directions, blend(matrices, weights)
+        force = _mass(model)[:, None, None] * (s - 2 * previous + before)
+        g, push = _product(d, _mass(model), transforms), pulled(d, transforms, force)
         h, k = 1 / model.fps, stiffness(_vibrations(model), static.reshape(-1, *static.shape[-2:]))
         q = self.bounded(model, _times(_inverse(self._system(model, g, k)), self.damping * h * _times(g, q) - push))
-        x = s + jnp.sum(p * q[None, None], axis=2)
+        swung = _matmul(d.reshape(-1, self.modes), q).reshape(s.shape)
+        x = s + sum(transforms[:, :, i] * swung[:, i, None] for i in range(3))
         new = jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in (x, previous, now, q, jnp.ones_like(started))])
         q = q.T.reshape(*shape, self.modes)
         return new.T.reshape(*shape, self.state), Codes(fixed, self._dynamic(params, q), q)
@@ -251,15 +255,6 @@ class Swing:
         inertia = (g * model.fps**2)[:, None] * r
         return jnp.sum(r * (inertia / 2 - force.T), axis=0), _matmul(along, inertia - force.T).reshape(moved.shape)
 
-    def _static_garment(self, params, model, z, matrices):
-        """The static garment (verts, 3, poses) and the swing's directions there (verts, 3, modes, poses)."""
-        weights = garment_blend(self, params, model)
-        transforms = blend(matrices, weights)
-        offsets = decode(self, params, model, z)
-        directions = _vibrations(model).directions
-        p = sum(transforms[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
-        return pose_garment(model, offsets, matrices, weights), p
-
     def _system(self, model, g, stiff):
         """G (1 + c h) + h^2 K, poses last."""
         h = 1 / model.fps
@@ -304,17 +299,24 @@ def _mass(model: Model) -> Float[Array, "verts"]:
     return model.material.density * model.garment.mesh.vertex_area
 
 
-def _push(model, p, y):
-    """P^T M y (modes, poses)."""
-    return jnp.sum(p * (_mass(model)[:, None, None] * y)[:, :, None], axis=(0, 1))
+def _product(directions, mass, transforms):
+    """P^T M P (modes, modes, poses), P = R D.
 
-
-def _product(model, p, q):
-    """P^T M Q (modes, modes, poses)."""
-    weighted = _mass(model)[:, None, None, None] * p
-    if p.shape[-1] < FEW:
-        return jnp.einsum("vikp,vilp->klp", weighted, q, precision="highest")
-    return jnp.stack([jnp.sum(weighted[:, :, k, None] * q, axis=(0, 1)) for k in range(p.shape[2])])
+    Of few poses by P; of many by R^T R, six numbers a vertex, and so as a product of matrices with what is of no pose.
+    """
+    if transforms.shape[-1] < FEW:
+        p = sum(transforms[:, :, i, None] * directions[:, i, :, None][:, None] for i in range(3))
+        return jnp.einsum("vikp,vilp->klp", mass[:, None, None, None] * p, p, precision="highest")
+    axes, modes = np.triu_indices(3), directions.shape[-1]
+    k, other = np.tril_indices(modes)
+    squares = sum(transforms[:, i, axes[0]] * transforms[:, i, axes[1]] for i in range(3))
+    left, right = (directions[:, a] for a in axes)
+    both = left[..., k] * right[..., other] + right[..., k] * left[..., other]
+    share = jnp.where(axes[0] == axes[1], 0.5, 1).astype(mass.dtype)[None] * mass[:, None]
+    constant = (share[..., None] * both).reshape(-1, len(k))
+    place = np.zeros((modes, modes), int)
+    place[k, other] = place[other, k] = np.arange(len(k))
+    return _matmul(constant.T, squares.reshape(len(constant), -1))[place]
 
 
 def _times(matrix, x):

@@ -58,10 +58,10 @@ def couplings_from(mesh: Mesh, points: ContactPoints | None = None) -> Couplings
 
     def place(p):
         index = np.searchsorted(pairs @ size, np.sort(p, axis=-1) @ size)
-        return jnp.asarray(index, jnp.int32), jnp.asarray(p[..., 0] > p[..., 1])
+        return jax.device_put((index.astype(np.int32), p[..., 0] > p[..., 1]))
 
     edges, _ = place(np.asarray(mesh.edges))
-    found = Couplings(jnp.asarray(pairs, jnp.int32), *place(of_faces), *place(of_hinges), edge_pairs=edges)
+    found = Couplings(jax.device_put(pairs.astype(np.int32)), *place(of_faces), *place(of_hinges), edge_pairs=edges)
     if points is None:
         return found
     corners = np.asarray(points.corners)
