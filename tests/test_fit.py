@@ -15,7 +15,7 @@ from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare import garment_placement
-from ncs_jax.prepare.fit import BAND, bring_apart, fit, settle
+from ncs_jax.prepare.fit import BAND, bring_apart, fit, pins_of, settle
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.hanging import RAYS, trunk_of
 from ncs_jax.prepare.wearing import cloth_of, skin_of
@@ -249,6 +249,23 @@ def test_what_lies_on_top_of_the_body_needs_no_pins(body):
     lid = np.stack([last, np.roll(last, -1), np.full(24, len(x) - 1)], axis=1).astype(np.int32)
     found = fit("g.npz", io.GarmentRecord(x, np.concatenate([faces, lid])), body)
     assert "pins" not in found.garment.groups and found.carried > 0.01
+
+
+@pytest.mark.parametrize(("width", "held"), [(0.04, True), (0.1, False)])
+def test_straps_that_friction_alone_keeps_on_shoulders_are_pinned_there(width, held):
+    """A strip over skin that faces up, whose ends hang down."""
+    along = np.linspace(0, 0.6, 25)
+    path = np.stack([np.clip(along, 0.15, 0.45), 1 - np.abs(along - np.clip(along, 0.15, 0.45))], axis=1)
+    x = np.array([[z, y, side] for z, y in path for side in np.linspace(0, width, 5)])
+    grid = np.arange(len(x)).reshape(-1, 5)
+    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]).astype(np.int32)
+    lies = x[:, 1] > 0.999
+    away = np.where(lies[:, None], [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    pins, carried = pins_of(io.GarmentRecord(x, faces), np.full(len(x), 0.005), away)
+    assert carried > 0.01
+    middle = np.flatnonzero(lies & (np.abs(x[:, 0] - 0.3) < 0.14))  # the bends look half aside
+    assert lies[pins].all() and (np.isin(middle, pins).all() if held else not len(pins))
 
 
 def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):

@@ -198,7 +198,7 @@ def _say_what(found, given) -> None:
     """Print what was done to the garment at its place, and what it is made of."""
     import numpy as np
 
-    from ncs_jax.prepare.fit import PINS
+    from ncs_jax.prepare.fit import CARRIED, PINS
     from ncs_jax.prepare.garment_checks import summarise_surface
 
     g, (before, after) = found.garment, found.depth
@@ -214,7 +214,9 @@ def _say_what(found, given) -> None:
     if PINS in given.groups:
         print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:
-        print(f"  pins      {len(g.groups[PINS])} vertices around its highest opening: nothing else carries it")
+        told = "of narrow straps on the shoulders: nothing but friction keeps them there"
+        told = told if found.carried >= CARRIED else "around its highest opening: nothing else carries it"
+        print(f"  pins      {len(g.groups[PINS])} vertices {told}")
     else:
         print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
     own = "the file's own" if given.weights is not None else "those of the skin, found when the scene is made ready"

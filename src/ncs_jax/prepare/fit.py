@@ -21,7 +21,7 @@ from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.scene.spec import CollisionSpec
 
-__all__ = ["PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
+__all__ = ["CARRIED", "PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
 TRIES = 12  # of bringing cloth apart
@@ -31,6 +31,7 @@ OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away 
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
 CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
 BAND = 0.02  # m; height of a waistband
+OVER, STRAP = 0.08, 0.025  # m; from the top of a garment so far down it lies over shoulders; half the width of a narrow strap
 MOST = 0.1  # m; no clearance is larger, as no thickness of a scene's collision is, nor vertices that are one farther apart
 
 
@@ -182,21 +183,26 @@ def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> t
     """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; and the area carried, m^2.
 
     The body carries the upper half of the cloth where it lies on skin that faces up. If less than `CARRIED` is carried, the
-    highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it. distance (V,), away (V, 3): to
-    the body, m, and the unit vectors that lead away from it.
+    highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it. If all that is carried at the
+    top is within `STRAP` of the boundary, it is of narrow straps, which friction alone keeps on shoulders: they are pinned
+    there. distance (V,), away (V, 3): to the body, m, and the unit vectors that lead away from it.
     """
+    from scipy.spatial import cKDTree
+
     x, faces = garment.vertices.astype(np.float64), garment.faces
     double = np.linalg.norm(np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]]), axis=1)
     area = np.bincount(faces.ravel(), np.repeat(double / 6, 3), len(x))
     outward = vertex_normals(x, faces)
     outer = np.sum(outward * away, axis=1) > OUTWARD
     high = x[:, 1] > np.mean([x[:, 1].min(), x[:, 1].max()])
-    carried = float(area[(distance < NEAR) & (away[:, 1] > UPWARD) & outer & high].sum())
-    loops = boundary_loops(faces)
-    if carried >= CARRIED or not loops:
+    lying = (distance < NEAR) & (away[:, 1] > UPWARD) & outer & high
+    carried, loops = float(area[lying].sum()), boundary_loops(faces)
+    if not loops:
         return np.zeros(0, np.int32), carried
+    if carried >= CARRIED:
+        over = np.flatnonzero(lying & (x[:, 1] > x[:, 1].max() - OVER))
+        far, _ = cKDTree(x[np.concatenate(loops)]).query(x[over])
+        return (over if far.max(initial=0) < STRAP else over[:0]).astype(np.int32), carried
     top = max(loops, key=lambda loop: x[loop, 1].mean())
-    from scipy.spatial import cKDTree
-
     near, _ = cKDTree(x[top]).query(x)
     return np.flatnonzero(near <= BAND).astype(np.int32), carried
