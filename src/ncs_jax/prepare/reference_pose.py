@@ -57,7 +57,7 @@ class Reference:
     """A reference pose.
 
     turns: the world rotation C (J, 3, 3) of each joint. note: where the pose is from. root: the root's place (3,) in it; None:
-    that of the zero pose. uncertain: parts of a person that may be wrong, and the likely error in degrees.
+    that of the zero pose. uncertain: parts of a person that may be wrong, and by how many degrees in nine of ten recordings.
     """
 
     turns: np.ndarray
@@ -316,5 +316,5 @@ def _built(motion: MotionRecord, of: Limbs, up: str) -> Reference | None:
     doubts = {part: error for part, error in found[1].items() if error >= SURE}
     if doubts:
         about = ", ".join(f"{part} {error:.0f}" for part, error in doubts.items())
-        note += f", {about} degrees; motion.rest names a better one, as a frame in T-pose"
+        note += f", in nine of ten recordings right to {about} degrees; motion.rest names a better one, as a frame in T-pose"
     return Reference(found[0], note, uncertain=doubts)

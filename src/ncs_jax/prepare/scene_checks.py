@@ -262,9 +262,14 @@ def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
         parts = dict.fromkeys(part for one in built.values() for part in one)
         worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)
         mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
-        risk = "they lean, or look up or down, by so much in all frames"
+        risk = "they lean, look up or down, or are twisted by so much in all frames"
         names = ", ".join([*built][:NAMED]) + (f" and {len(built) - NAMED} more" if len(built) > NAMED else "")
-        yield Risk("the pose at rest had to be built", f"right to about so many degrees: {worst}, in {names}", risk, mend)
+        yield Risk(
+            "the pose at rest had to be built",
+            f"right to so many degrees in nine of ten recordings: {worst}, in {names}",
+            risk,
+            mend,
+        )
 
 
 def _posture(a: Setting, name: str) -> Iterator[Risk]:
