@@ -148,6 +148,17 @@ def test_a_person_at_rest_stays_as_it_is(body, droop):
     assert auto.notes == zero.notes
 
 
+@pytest.mark.parametrize("heading", [7, 30, -100, 135])
+def test_a_zero_pose_that_looks_aside_is_turned_to_an_axis(body, heading):
+    """A character that was turned before it was exported moves as before, in its trunk, collars and feet too."""
+    motion, turn = walk(), Rotation.from_euler("y", heading, degrees=True).as_matrix()
+    other = told_since(motion, np.broadcast_to(turn, (len(motion.parents), 3, 3)))
+    angle, far = apart(driven(motion, body), driven(other, body))
+    assert angle.max() < 0.1 and far < 1e-3
+    assert apart(driven(motion, body), driven(other, body, rest="zero"))[0].max() > 6
+    assert "aside of an axis" in " ".join(retarget_to_body(other, body, MotionSpec()).notes)
+
+
 @pytest.mark.parametrize("frame", [4, 18])
 def test_a_zero_pose_that_is_a_moment_of_the_motion_is_not_taken_for_standing(body, frame):
     """A step, its arms and legs apart and a foot tipped, is the zero pose: trunk and feet still stand as they do on average."""
@@ -456,6 +467,16 @@ def test_a_root_above_the_hips_and_bones_that_slide(tmp_path, body):
         angle, far = apart(found["plain"], one)
         assert angle.max() < 1e-3 and far < (0.002 if name == "slides" else 1e-5), name
     assert "bones slide" in " ".join(found["slides"][2].notes) and "carries the path" in " ".join(found["still"][2].notes)
+
+
+def test_a_path_that_leads_along_a_short_offset_is_a_place(tmp_path):
+    """Places of hips below a root stand for their OFFSET, however far they are from it."""
+    motion, short = walk(), np.array([0, 0, 0.06])
+    here = np.asarray(motion.joints)[0] + motion.translation - [0, 0, 2]
+    moved = replace(motion, joints=motion.joints - np.asarray(motion.joints)[0] + short)
+    (tmp_path / "a.bvh").write_text(bvh_text(moved, {motion.joint_names[0]: here}, np.zeros((FRAMES, 3))))
+    found = io.read_motion(tmp_path / "a.bvh")
+    np.testing.assert_allclose(np.asarray(found.joints)[0] + found.translation, here, atol=1e-8)
 
 
 def test_a_prop_that_slides_on_a_hand_is_left_out(tmp_path, body):

@@ -22,6 +22,7 @@ from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import (
     ZERO,
+    facing,
     find_reference,
     from_frame,
     is_even,
@@ -126,6 +127,7 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
     if spec.rest == "zero":
         return motion
     if spec.rest == "auto" and person and not bent and is_even(rest_of(motion)[0], of):
+        motion = facing(motion, of)
         return replace(motion, uncertain={part + ZERO: by for part, by in odd_parts(motion, of).items()})
     up = motion.up or standing_axis(motion, of)
     if spec.rest == "auto":

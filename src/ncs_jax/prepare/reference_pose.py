@@ -29,6 +29,7 @@ from ncs_jax.prepare.skeleton import (
     body_axes,
     forward,
     joint_turns,
+    least_turn,
     person_axes,
     rest_of,
     sampled,
@@ -38,7 +39,7 @@ from ncs_jax.prepare.skeleton import (
     trunk_of,
 )
 
-__all__ = ["ZERO", "Reference", "find_reference", "from_frame", "is_even", "is_person", "leans", "odd_parts", "since"]
+__all__ = ["ZERO", "Reference", "facing", "find_reference", "from_frame", "is_even", "is_person", "leans", "odd_parts", "since"]
 
 SURE = 1.0  # degrees; a part of a built pose that is surer than that is not told
 EVEN = 15.0  # degrees by which limbs of a skeleton at rest may differ from their images in the mirror
@@ -47,6 +48,7 @@ LEAN = 12.0  # degrees by which hips to head lean in a zero pose that is bent (3
 # by which these lie outside what 18 of 20 upright frames do, where the zero pose is bent alone.
 BUILT = {"neck": (3.0, 45.0), "head": (-25.0, 25.0), "collars": (-18.0, 18.0)}
 ODD = {"neck": 20.0, "head": 20.0, "collars": 15.0}
+ASIDE = 5.0  # degrees by which a zero pose may look aside of an axis of coordinates before it is turned
 ZERO = " of the zero pose"  # ends the name of such a part
 BACKWARD = 0.8  # share of the frames in which feet point back where sides are exchanged (0)
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
@@ -146,6 +148,22 @@ def is_even(places: np.ndarray, of: Limbs) -> bool:
     """
     own = places @ person_axes(places, of, "y")
     return _asymmetry(own, of) < EVEN or _bend(own, of) < EVEN
+
+
+def facing(motion: MotionRecord, of: Limbs) -> MotionRecord:
+    """Return a motion whose zero pose looks along an axis of coordinates, where it looks aside by more than `ASIDE` degrees.
+
+    A character that was turned before it was exported, or a recorder whose first pose looks anywhere, has such a zero pose.
+    """
+    rest, left = rest_of(motion)[0], side_vector(rest_of(motion)[0], of)
+    axes = body_axes(rest, of)
+    flat = left - (left @ axes[:, 1]) * axes[:, 1]
+    aside = angle(flat, axes[:, 0]) if np.linalg.norm(flat) > 0 else 0.0
+    if aside <= ASIDE:
+        return motion
+    turn = np.broadcast_to(least_turn(flat, axes[:, 0]), (len(rest), 3, 3))
+    note = f"its zero pose looks {aside:.0f} degrees aside of an axis, and is turned to it"
+    return replace(since(motion, Reference(turn, note)), notes=(*motion.notes, note))
 
 
 def leans(motion: MotionRecord, of: Limbs) -> bool:
