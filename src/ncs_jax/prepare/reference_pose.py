@@ -29,7 +29,6 @@ from ncs_jax.prepare.skeleton import (
     body_axes,
     forward,
     joint_turns,
-    least_turn,
     person_axes,
     rest_of,
     sampled,
@@ -48,7 +47,7 @@ LEAN = 12.0  # degrees by which hips to head lean in a zero pose that is bent (3
 # by which these lie outside what 18 of 20 upright frames do, where the zero pose is bent alone.
 BUILT = {"neck": (3.0, 45.0), "head": (-25.0, 25.0), "collars": (-18.0, 18.0)}
 ODD = {"neck": 20.0, "head": 20.0, "collars": 15.0}
-ASIDE = 5.0  # degrees by which a zero pose may look aside of an axis of coordinates before it is turned
+ASIDE = 5.0  # degrees by which a zero pose may be off the axes of coordinates before it is turned
 ZERO = " of the zero pose"  # ends the name of such a part
 BACKWARD = 0.8  # share of the frames in which feet point back where sides are exchanged (0)
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
@@ -146,24 +145,34 @@ def is_even(places: np.ndarray, of: Limbs) -> bool:
     Recorders without such a pose write the first frame of the motion as the zero pose: a moment of a step or a dance, in
     which trunk and feet are as they happen to be.
     """
-    own = places @ person_axes(places, of, "y")
+    own = places @ body_axes(places, of)
     return _asymmetry(own, of) < EVEN or _bend(own, of) < EVEN
 
 
 def facing(motion: MotionRecord, of: Limbs) -> MotionRecord:
-    """Return a motion whose zero pose looks along an axis of coordinates, where it looks aside by more than `ASIDE` degrees.
+    """Return a motion whose zero pose stands along axes of coordinates, where it is off by more than `ASIDE` degrees.
 
-    A character that was turned before it was exported, or a recorder whose first pose looks anywhere, has such a zero pose.
+    A character that was turned before it was exported, or a recorder whose first pose looks anywhere, has such a zero pose. It
+    leans as a whole where trunk and legs lean, and by the same.
     """
-    rest, left = rest_of(motion)[0], side_vector(rest_of(motion)[0], of)
-    axes = body_axes(rest, of)
-    flat = left - (left @ axes[:, 1]) * axes[:, 1]
-    aside = angle(flat, axes[:, 0]) if np.linalg.norm(flat) > 0 else 0.0
-    if aside <= ASIDE:
+    rest, axes = rest_of(motion)[0], body_axes(rest_of(motion)[0], of)
+    left, up = side_vector(rest, of), axes[:, 1]
+    thighs, feet = ([of.roles.get(f"{side} {part}") for side in ("left", "right")] for part in ("thigh", "foot"))
+    if None not in (*thighs, *feet):
+        trunk, legs = rest[top(of)] - rest[thighs].mean(axis=0), (rest[thighs] - rest[feet]).mean(axis=0)
+        if min(angle(trunk, up), angle(legs, up)) > ASIDE > angle(trunk, legs):
+            up = rest[top(of)] - rest[feet].mean(axis=0)
+    left = left - (left @ up) * up / (up @ up)
+    if not np.linalg.norm(left) > 0:
         return motion
-    turn = np.broadcast_to(least_turn(flat, axes[:, 0]), (len(rest), 3, 3))
-    note = f"its zero pose looks {aside:.0f} degrees aside of an axis, and is turned to it"
-    return replace(since(motion, Reference(turn, note)), notes=(*motion.notes, note))
+    own = np.stack([v / np.linalg.norm(v) for v in (left, up, np.cross(left, up))], axis=1)
+    turn = axes @ own.T
+    off = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
+    if off <= ASIDE:
+        return motion
+    note = f"its zero pose is {off:.0f} degrees off the axes, and is turned to them"
+    whole = Reference(np.broadcast_to(turn, (len(rest), 3, 3)), note)
+    return replace(since(motion, whole), notes=(*motion.notes, note))
 
 
 def leans(motion: MotionRecord, of: Limbs) -> bool:
