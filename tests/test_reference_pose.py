@@ -148,7 +148,7 @@ def test_a_person_at_rest_stays_as_it_is(body, droop):
     assert auto.notes == zero.notes
 
 
-@pytest.mark.parametrize("turn", [(0, 7, 0), (0, 30, 0), (0, -100, 0), (0, 135, 0), (8, 0, 0), (-20, 0, 0), (20, 40, 15)])
+@pytest.mark.parametrize("turn", [(0, 3, 0), (0, 30, 0), (0, -100, 0), (0, 135, 0), (8, 0, 0), (-20, 0, 0), (20, 40, 15)])
 def test_a_zero_pose_that_is_turned_as_a_whole_is_turned_back(body, turn):
     """A character that was turned before it was exported moves as before, in its trunk, collars and feet too."""
     motion, whole = walk(), Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
@@ -156,7 +156,7 @@ def test_a_zero_pose_that_is_turned_as_a_whole_is_turned_back(body, turn):
     right, taken = driven(motion, body), driven(other, body)
     angle, far = apart(right, (taken[0], taken[1] + right[1][0, 0] - taken[1][0, 0]))
     assert angle.max() < 2 and far < 0.02 and not taken[2].uncertain  # its head is 1 degree ahead of its feet
-    assert apart(right, driven(other, body, rest="zero"))[0].max() > 6
+    assert apart(right, driven(other, body, rest="zero"))[0].max() > 2.5
     assert "degrees off the axes" in " ".join(retarget_to_body(other, body, MotionSpec()).notes)
 
 

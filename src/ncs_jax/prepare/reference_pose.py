@@ -47,7 +47,7 @@ LEAN = 12.0  # degrees by which hips to head lean in a zero pose that is bent (3
 # by which these lie outside what 18 of 20 upright frames do, where the zero pose is bent alone.
 BUILT = {"neck": (3.0, 45.0), "head": (-25.0, 25.0), "collars": (-18.0, 18.0)}
 ODD = {"neck": 20.0, "head": 20.0, "collars": 15.0}
-ASIDE = 5.0  # degrees by which a zero pose may be off the axes of coordinates before it is turned
+ASIDE, ALONG = 2.0, 5.0  # degrees by which a zero pose may look aside of an axis, and lean as a whole, before it is turned
 ZERO = " of the zero pose"  # ends the name of such a part
 BACKWARD = 0.8  # share of the frames in which feet point back where sides are exchanged (0)
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
@@ -150,17 +150,17 @@ def is_even(places: np.ndarray, of: Limbs) -> bool:
 
 
 def facing(motion: MotionRecord, of: Limbs) -> MotionRecord:
-    """Return a motion whose zero pose stands along axes of coordinates, where it is off by more than `ASIDE` degrees.
+    """Return a motion whose zero pose stands along axes of coordinates, where it is off by more than `ASIDE` or `ALONG`.
 
     A character that was turned before it was exported, or a recorder whose first pose looks anywhere, has such a zero pose. It
     leans as a whole where trunk and legs lean, and by the same.
     """
     rest, axes = rest_of(motion)[0], body_axes(rest_of(motion)[0], of)
     left, up = side_vector(rest, of), axes[:, 1]
-    thighs, feet = ([of.roles.get(f"{side} {part}") for side in ("left", "right")] for part in ("thigh", "foot"))
-    if None not in (*thighs, *feet):
+    thighs, feet = ([of.roles[r] for side in ("left", "right") if (r := f"{side} {p}") in of.roles] for p in ("thigh", "foot"))
+    if len(thighs) == len(feet) == 2:
         trunk, legs = rest[top(of)] - rest[thighs].mean(axis=0), (rest[thighs] - rest[feet]).mean(axis=0)
-        if min(angle(trunk, up), angle(legs, up)) > ASIDE > angle(trunk, legs):
+        if min(angle(trunk, up), angle(legs, up)) > ALONG > angle(trunk, legs):
             up = rest[top(of)] - rest[feet].mean(axis=0)
     left = left - (left @ up) * up / (up @ up)
     if not np.linalg.norm(left) > 0:
