@@ -462,6 +462,11 @@ cf_j_root cf_n_height cf_j_hips=h cf_j_spine01=s cf_j_spine02=s cf_j_spine03=s c
 cf_j_spine03: cf_d_shoulder_{L} cf_j_shoulder_{L}=c cf_j_arm00_{L}=a cf_j_forearm01_{L}=f cf_j_hand_{L}=w cf_j_index01_{L}
 cf_j_hips: cf_j_waist01 cf_j_waist02 cf_j_thigh00_{L}=t cf_j_leg01_{L}=k cf_j_foot_{L}=o cf_j_toes_{L}=e
 """,
+    "Chinese": """
+髋=h 脊柱1=s 脊柱2=s 胸=s 颈=n 头=H
+胸: {J}锁骨=c {J}上臂=a {J}前臂=f {J}手=w
+髋: {J}大腿=t {J}小腿=k {J}脚=o {J}脚趾=e
+""",
     "H-Anim": """
 hanim_humanoid_root=h hanim_vl5=s hanim_vl3=s hanim_vt10=s hanim_vt1=s hanim_vc4=n hanim_skullbase=H
 hanim_vt1: hanim_{l}_sternoclavicular=c hanim_{l}_acromioclavicular hanim_{l}_shoulder=a hanim_{l}_elbow=f

@@ -133,14 +133,32 @@ def test_a_motion_whose_names_say_nothing_drives_as_one_whose_names_do(rng):
     assert not any("told by the shape" in note for note in expected.motion.notes) and not found.motion.undriven
 
 
-@pytest.mark.parametrize("part", ["arm", "forearm", "thigh", "shin", "foot"])
+def test_the_numbers_of_a_tools_actors_do_not_matter():
+    names, parents, expected = skeleton(SKELETONS["Poser"])
+    assert limbs(anatomy([f"{name}:{1 + j % 3}" for j, name in enumerate(names)], parents)) == expected
+
+
+def test_the_end_of_a_limb_may_be_called_anything():
+    """What alone hangs on a shin is the foot; of two neither is, nor is a helper."""
+    names, parents, _, keys = figure("poser")
+    foot, shin = (keys.index(("left", part)) for part in ("foot", "shin"))
+    called = [*names]
+    called[foot] = "lLeg3"
+    assert anatomy(called, parents.tolist()).roles["left foot"] == foot
+    assert "left foot" not in anatomy([*called, "lFlap"], [*parents.tolist(), shin]).roles
+    assert anatomy([*called, "lShinTwist"], [*parents.tolist(), shin]).roles["left foot"] == foot
+    called[foot] = "lShinTip"
+    assert "left foot" not in anatomy(called, parents.tolist()).roles
+
+
+@pytest.mark.parametrize("part", ["arm", "forearm", "thigh", "shin"])
 def test_a_limb_that_nothing_drives_is_told_with_the_likeliest_joint(rng, part):
     motion, body, keys = motion_of("poser", rng), body_of("unreal"), figure("poser")[3]
     motion = replace(motion, joints=along_an_axis(motion.joints, motion.parents))  # so that no shape tells it
     lost = keys.index(("left", part))
     names = [f"{n}Qx" if j == lost else n for j, n in enumerate(motion.joint_names)]
     found = retarget(replace(motion, joint_names=tuple(names)), body).motion
-    ours = {"arm": "upperarm_l", "forearm": "lowerarm_l", "thigh": "thigh_l", "shin": "calf_l", "foot": "foot_l"}[part]
+    ours = {"arm": "upperarm_l", "forearm": "lowerarm_l", "thigh": "thigh_l", "shin": "calf_l"}[part]
     bone = "upper arm" if part == "arm" else part
     assert found.undriven == {f"left {bone}": f'motion.joints = {{ "{names[lost]}" = "{ours}" }}'}
     mended = retarget(replace(motion, joint_names=tuple(names)), body, joints={names[lost]: ours}).motion

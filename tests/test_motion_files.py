@@ -13,7 +13,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.character.smpl import smpl_parents
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.motion_import import load_motion
-from ncs_jax.prepare.scene_checks import _cut_short
+from ncs_jax.prepare.scene_checks import _cut_short, _radians
 from ncs_jax.scene.spec import scene_from
 
 HIERARCHY = """\
@@ -120,6 +120,19 @@ def test_a_file_that_is_cut_short_is_at_risk(tmp_path, case):
         "half a frame": ["7 of the 8 frames that its header says are there, in a.bvh"],
     }.get(case, [])
     assert not list(_cut_short(found, "a.bvh", (0, frames)))
+
+
+def test_rotations_that_may_be_radians_are_at_risk(tmp_path):
+    """All within half a turn in radians, in enough frames; not where one is larger, nor in a few frames."""
+    few = np.tile(FRAMES, (3, 1))
+    few[:, 3:] *= 3.1 / np.abs(few[:, 3:]).max()
+    large = few.copy()
+    large[5, 4] = 3.2
+    told = []
+    for values in (few, large, few[:8]):
+        record = read(tmp_path, bvh(f"Frames: {len(values)}\nFrame Time: 0.033333\n", rows(values)))
+        told.append([risk.value for risk in _radians(record, "a.bvh")])
+    assert told == [["at most 3.1 degrees, in a.bvh"], [], []]
 
 
 @pytest.mark.parametrize(

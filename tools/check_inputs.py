@@ -32,6 +32,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.packaged import packaged
+from ncs_jax.io.tables.files import text_of
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.scene.spec import MotionSpec, load_scene
 
@@ -62,23 +63,23 @@ class Driven:
 def bvh_places(text: str) -> dict[str, np.ndarray]:
     """Return the places (T, 3) of the joints of a .bvh by name, in the file's unit: read and posed without the package."""
     text = re.sub(r"(?m)^#.*$", "", text)
-    head, _, data = text.partition("MOTION")
-    numbers = data.split("Time", 1)[1].lstrip(" :").split()[1:]
+    head, data = re.split(r"(?im)^\s*motion\s*$", text, maxsplit=1)
+    numbers = re.split("(?i)time", data, maxsplit=1)[1].lstrip(" :").split()[1:]
     rows = np.array([float(n.replace(",", ".")) for n in numbers])
     joints: list[dict] = []
     chain: list[dict] = []
-    words = iter(re.sub(r"([{}])", r" \1 ", head).replace("HIERARCHY", " ").split())
-    for word in words:
-        if word in ("ROOT", "JOINT", "End"):
+    words = iter(re.sub(r"([{}])", r" \1 ", head).lstrip("\ufeff").split())
+    for word in map(str.upper, words):
+        if word in ("ROOT", "JOINT", "END"):
             name = []
             while (part := next(words)) != "{":
                 name.append(part)
-            chain.append({"name": " ".join(name), "parent": chain[-1] if chain else None, "channels": [], "end": word == "End"})
-            joints += [] if word == "End" else [chain[-1]]
+            chain.append({"name": " ".join(name), "parent": chain[-1] if chain else None, "channels": [], "end": word == "END"})
+            joints += [] if word == "END" else [chain[-1]]
         elif word == "OFFSET":
             chain[-1]["offset"] = np.array([float(next(words).replace(",", ".")) for _ in range(3)])
         elif word == "CHANNELS":
-            chain[-1]["channels"] = [next(words) for _ in range(int(next(words)))]
+            chain[-1]["channels"] = [next(words).capitalize() for _ in range(int(next(words)))]
         elif word == "}":
             chain.pop()
     width = sum(len(j["channels"]) for j in joints)
@@ -189,7 +190,7 @@ def _compare(folder: Path, motions: dict[str, MotionRecord], body: BodyRecord) -
             continue
         line = []
         if name.endswith(".bvh"):
-            own = bvh_places((folder / name).read_text(encoding="utf-8", errors="replace"))
+            own = bvh_places(text_of(folder / name)[1])
             angle, where = limbs_apart(driven, own, body.joint_names)
             line.append(f"limbs to {angle:.2f} degrees ({where})")
             good &= angle < CLOSE[1]

@@ -103,7 +103,7 @@ class MotionRecord:
         absent: names in `motion.joints` that are no joint of this motion, each with the likeliest that is one, or "".
         driven: of a motion that was retargeted, the source's joint for each joint of the body that one drives.
         undriven: limbs of the body that nothing drives, such as "left upper arm", each with what mends it.
-        uncertain: parts of a person, such as "head", whose reference pose had to be built, and the likely error in degrees;
+        uncertain: parts of a person, such as "head", whose reference pose had to be built, and to how many degrees it is right;
             or "head of the zero pose", that is bent there as in no frame, and by how much.
     """
 

@@ -23,20 +23,24 @@ from scipy.spatial.transform import Rotation
 from ncs_jax.io import MotionRecord
 from ncs_jax.io.character.rig import quarter_turns
 from ncs_jax.prepare.joint_names import Limbs
-from ncs_jax.prepare.skeleton import LIMBS, angle, forward, least_turn, person_axes, rest_of, sampled, top, trunk_of
+from ncs_jax.prepare.skeleton import LIMBS, angle, bone, forward, least_turn, person_axes, rest_of, sampled, top, trunk_of
 
 __all__ = ["FEWEST", "UPRIGHT", "build_pose"]
 
 UPRIGHT = 35.0  # degrees by which hips to head may lean in a frame that tells about standing
 FEWEST = 3  # such frames
 POSTURE = 8.0  # degrees by which people who stand and walk lean and bend a joint of the trunk, on average
-LOOK = 15.0  # degrees by which people look down or up on average
+LOOK, NOD = 15.0, 10.0  # degrees by which people look down or up on average, by the head and by the neck
+UNSAID = 4.0  # degrees by which a bone of the trunk that stands vertically on average may lean at rest
+HANDS = {"forearms": 17.0, "hands": 25.0}  # degrees by which these are twisted on average, which nothing tells
+TOLD = 2.0  # standard deviations that are told: nine of ten recordings are closer
 NEAR = 15.0  # degrees within which a joint's axes are a standing person's, where they tell
 STRAIGHT = 15.0  # degrees by which a leg that is straight is bent
 UP, LEFT, AHEAD = np.eye(3)[[1, 0, 2]]
 # Degrees by which chains of bones pitch ahead at rest, at least and at most, as skeletons differ (CMU's of 22 and of 31 joints,
 # SMPL's, Mixamo's, the packaged body's): from between the hip joints to the chest and to the head, of the neck, of a foot down.
 CHEST, HEAD, NECK, FOOT = (-1.0, 3.0), (-1.5, 2.5), (9.0, 39.0), (10.0, 33.0)
+CROWN = (-3.0, 9.0)  # and from the head to the end of its bone, where a file has it
 APART = 0.08  # of the height from hips to head by which joints of the trunk stand ahead of each other
 LEVEL, ALIKE = 6.0, 4.0  # degrees by which feet on the ground pitch on average, and one more than the other
 BEYOND = 2.0  # degrees by which a skeleton may leave these bounds
@@ -50,7 +54,7 @@ def build_pose(motion: MotionRecord, of: Limbs, up: str, moment: bool) -> tuple[
       and no other bone of the trunk leans aside. Where that is within `NEAR` degrees of the joint's own axes, and these tell
       more than the bone's direction, they stand as the axes do, unless the zero pose is a moment of a movement. Where all bones
       from hips to neck are within `POSTURE` degrees of the vertical on average, they are vertical. What is settled by neither
-      pitches as is most likely, see above.
+      pitches as is most likely, see above. The end of the head's bone is above it, unless the zero pose is a moment.
     - A thigh points down, an arm to its side, a forearm along the arm. The shin is to the thigh as in the frame that bends the
       knee least, if it is straight there.
     - The twist about a bone lets elbows bend forward and knees backward, where they bend; else it is least on average.
@@ -63,7 +67,8 @@ def build_pose(motion: MotionRecord, of: Limbs, up: str, moment: bool) -> tuple[
             a moment of a movement.
 
     Returns:
-        C (J, 3, 3), the world rotation of each joint, and the likely error of hips, spine, chest, neck, head and feet, degrees.
+        C (J, 3, 3), the world rotation of each joint, and for hips, spine, chest, neck, head, collars, feet, forearms and hands
+        the degrees to which they are right in nine of ten recordings.
     """
     turns, places = forward(sampled(motion))
     trunk = places[:, top(of)] - places[:, of.roles["hips"]]
@@ -72,7 +77,9 @@ def build_pose(motion: MotionRecord, of: Limbs, up: str, moment: bool) -> tuple[
         return None
     axes = person_axes(places, of, up)
     near, alike = (0, 0) if moment else (NEAR, POSTURE)
-    build = _Builder(turns[upright], places[upright], axes[upright], of, near, alike)
+    crown = None if moment or "head" not in of.roles else bone(of, "", rest_of(motion)[0], motion.tips, of.roles["head"])
+    crown = None if crown is None else crown / np.linalg.norm(crown)
+    build = _Builder(turns[upright], places[upright], axes[upright], of, near, alike, crown)
     return build.pose(rest_of(motion)[1]), build.deviations()
 
 
@@ -81,6 +88,7 @@ class _Builder:
     """Frames of an upright person: world rotations (T, J, 3, 3), places (T, J, 3), the person's axes (T, 3, 3), limbs.
 
     near, alike: degrees within which a joint's axes are taken for a standing person's, where they tell, and where they do not.
+    crown: the direction (3,) from the head to the end of its bone, as seen from the head; None where that is not known.
     """
 
     turns: np.ndarray
@@ -89,6 +97,7 @@ class _Builder:
     of: Limbs
     near: float
     alike: float
+    crown: np.ndarray | None
 
     def pose(self, parents: np.ndarray) -> np.ndarray:
         """Return C (J, 3, 3), parents before children."""
@@ -109,20 +118,22 @@ class _Builder:
         return out
 
     def deviations(self) -> dict[str, float]:
-        """Return the likely errors, degrees."""
+        """Return the degrees to which parts are right in nine of ten recordings."""
         parts = {"hips": [self.of.roles["hips"]], "spine": self.of.spine[:-1], "chest": self.of.spine[-1:]}
         parts |= {"neck": self.of.neck, "head": [self.of.roles[r] for r in ("head",) if r in self.of.roles]}
         found = {part: max(self.trunk[1][j] for j in joints) for part, joints in parts.items() if len(joints)}
         if "chest" in found and "left clavicle" in self.of.roles:
             found["collars"] = float(np.hypot(found["chest"], POSTURE))
-        return found | ({"feet": max(self.feet[1].values())} if self.feet[1] else {})
+        found |= {"feet": max(self.feet[1].values())} if self.feet[1] else {}
+        found |= {part: by for part, by in HANDS.items() if "left hand" in self.of.roles}
+        return {part: TOLD * by for part, by in found.items()}
 
     @cached_property
     def trunk(self) -> tuple[dict[int, np.ndarray], dict[int, float]]:
-        """C (3, 3) of the joints from hips to head, and their likely errors in degrees."""
+        """C (3, 3) of the joints from hips to head, and the standard deviations of their errors, degrees."""
         joints = trunk_of(self.of)
         found = [self._upright(j, above) for j, above in zip(joints, [*joints[1:], None], strict=True)]
-        turns, settled = [columns.T for columns, _ in found], np.array([one for _, one in found])
+        turns, unsaid = [columns.T for columns, _ in found], np.array([doubt for _, doubt in found])
         bones = np.array([c @ self._bone(a, b) for c, (a, b) in zip(turns[:-1], pairwise(joints), strict=True)])
         if not len(bones):  # legs alone
             return dict(zip(joints, turns, strict=True)), dict.fromkeys(joints, POSTURE)
@@ -134,20 +145,24 @@ class _Builder:
         chains = [(0, last, HEAD), (0, chest, CHEST), (chest + 1, last, NECK)]
         chains += [(k, k + 1, (-ahead[k], ahead[k])) for k in range(min(chest + 1, last))]
         chains = [chain for chain in chains if chain[0] < chain[1]]
-        given = np.where(settled, 1e-2, [LOOK if j == self.of.roles.get("head") else POSTURE for j in joints])
+        if self.crown is not None:
+            bones, chains = np.vstack([bones, turns[-1] @ self.crown]), [*chains, (last, last + 1, CROWN)]
+        prior = [POSTURE if k <= chest else LOOK if j == self.of.roles.get("head") else NOD for k, j in enumerate(joints)]
+        given = np.where(np.isfinite(unsaid), 1e-2, prior)
 
         def misfit(theta: np.ndarray) -> np.ndarray:
-            now = Rotation.from_rotvec(theta[:last, None] * LEFT, degrees=True).apply(bones)
+            now = Rotation.from_rotvec(theta[: len(bones), None] * LEFT, degrees=True).apply(bones)
             sums = np.array([now[first:end].sum(axis=0) for first, end, _ in chains]).reshape(-1, 3)
             return np.append(theta / given, _beyond(np.degrees(np.arctan2(sums[:, 2], sums[:, 1])), [c[2] for c in chains]))
 
         theta, deviation = _most_likely(misfit, len(joints), [chain[2] for chain in chains])
+        deviation = np.hypot(deviation, np.where(np.isfinite(unsaid), unsaid, 0))
         turned = [Rotation.from_rotvec(t * LEFT, degrees=True).as_matrix() @ c for t, c in zip(theta, turns, strict=True)]
         return dict(zip(joints, turned, strict=True)), dict(zip(joints, deviation.tolist(), strict=True))
 
     @cached_property
     def feet(self) -> tuple[dict[int, np.ndarray], dict[int, float]]:
-        """C (3, 3) of the feet flat on the ground, and their likely errors in degrees."""
+        """C (3, 3) of the feet flat on the ground, and the standard deviations of their errors, degrees."""
         feet = {side: j for side in ("left", "right") if (j := self.of.roles.get(f"{side} foot")) is not None}
         turns = {j: self._standing(j, self.of.roles.get(f"{side} toe")).T for side, j in feet.items()}
         bones = [turns[j] @ self._bone(j, t) for s, j in feet.items() if (t := self.of.roles.get(f"{s} toe")) is not None]
@@ -167,9 +182,11 @@ class _Builder:
     @cached_property
     def straight(self) -> bool:
         """Whether all bones from the hips to the neck may be vertical in a person who stands: they are nearly so on average."""
-        chain = [self.of.roles["hips"], *self.of.spine, *self.of.neck[:1]]
-        seen = [(self._mean(a, self.axes, self.straightest)[:, 1], self._direction(a, b)) for a, b in pairwise(chain)]
-        return all(angle(up, bone) < POSTURE for up, bone in seen)
+        return all(self._vertical(a, b) for a, b in pairwise([self.of.roles["hips"], *self.of.spine, *self.of.neck[:1]]))
+
+    def _vertical(self, j: int, end: int) -> bool:
+        """Tell whether a bone is nearly vertical on average."""
+        return bool(angle(self._mean(j, self.axes, self.straightest)[:, 1], self._direction(j, end)) < POSTURE)
 
     @cached_property
     def straightest(self) -> np.ndarray:
@@ -196,24 +213,33 @@ class _Builder:
         seen = self._bone(j, end)
         return seen / max(float(np.linalg.norm(seen)), 1e-30)
 
-    def _upright(self, j: int, above: int | None) -> tuple[np.ndarray, bool]:
-        """Return columns that point left, up and ahead as seen from a joint of the trunk, and whether its pitch is settled."""
+    def _upright(self, j: int, above: int | None) -> tuple[np.ndarray, float]:
+        """Return columns that point left, up and ahead as seen from a joint of the trunk, and the deviation of its pitch:
+        0 where the axes tell, infinity where nothing does."""
         mean, left = self._mean(j, self.axes, self.straightest), self._left(j)
         bone = None if above is None else self._direction(j, above)
-        if left is None and bone is not None:
-            left = mean[:, 0] - (mean[:, 0] @ bone) * bone
+        middle = self.crown if bone is None else bone
+        if left is None and middle is not None:
+            left = mean[:, 0] - (mean[:, 0] @ middle) * middle
         if left is not None and angle(left, mean[:, 0]) < NEAR:
             mean = least_turn(mean[:, 0], left) @ mean
-        own = max(quarter_turns(), key=lambda q: np.trace(q.T @ mean))
-        if bone is None or not bone.any():
-            return (own, True) if _turn(own, mean) < self.near else (mean, False)
+        own = _own(mean)
+        if above is None or bone is None or not bone.any():
+            return (own, 0) if _turn(own, mean) < self.near and self.along_axes else (mean, np.inf)
         tells = 0.5 < angle(bone, own[:, 1]) < 45 and abs(bone @ own[:, 0]) < 0.01
         if tells and _turn(own, mean) < self.near:
-            return own, True
-        if self.straight:
+            return own, 0
+        if self.straight and (j not in self.of.neck or self._vertical(j, above)):
             mean = least_turn(mean[:, 1], bone) @ mean
-            return (own if _turn(own, mean) < self.alike and angle(bone, own[:, 1]) < 0.5 else mean), True
-        return mean, False
+            along = _turn(own, mean) < self.alike and angle(bone, own[:, 1]) < 0.5
+            return (own, 0) if along else (mean, UNSAID)
+        return mean, np.inf
+
+    @cached_property
+    def along_axes(self) -> bool:
+        """Whether half of the joints from hips to neck have axes that are nearly a standing person's: so may the head's be."""
+        means = [self._mean(j, self.axes, self.straightest) for j in trunk_of(self.of)[:-1]]
+        return sum(_turn(_own(mean), mean) < self.near for mean in means) * 2 >= len(means)
 
     def _left(self, j: int) -> np.ndarray | None:
         """Return the direction from right to left as seen from the hips or the chest: between the joints that hang on them."""
@@ -283,6 +309,11 @@ class _Builder:
         bone = self._direction(j, end)
         mean = mean - (mean @ bone) * bone
         return mean / np.linalg.norm(mean)
+
+
+def _own(turn: np.ndarray) -> np.ndarray:
+    """Return the quarter turn (3, 3) that is nearest to a rotation."""
+    return max(quarter_turns(), key=lambda q: np.trace(q.T @ turn))
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> float:

@@ -15,6 +15,7 @@ from ncs_jax.prepare.joint_words import EITHER, MIDDLE, ROLES, Name, read_names
 __all__ = ["Limbs", "anatomy", "listed", "pair", "propose", "side_and_rest", "undriven"]
 
 BONES = {"arm": "upper arm", "forearm": "forearm", "thigh": "thigh", "shin": "shin", "foot": "foot"}
+ENDS = (("shin", "foot"), ("forearm", "hand"))  # what follows the last long bone of a limb, whatever it is called
 TOES = 3  # as many toes or more beside each other are single toes, and none of them is the ball of the foot
 
 
@@ -76,6 +77,9 @@ def anatomy(names: Sequence[str], parents: Sequence[int], joints: np.ndarray | N
     named = _limb_roles(read, tree)
     shaped = {} if joints is None else _missing(named, read, parents, joints)
     roles = named | shaped
+    for side in ("left", "right"):
+        for above, below in ENDS:
+            roles |= _lone_end(f"{side} {below}", roles.get(f"{side} {above}"), roles, read, parents)
 
     def meet(*words: str) -> int | None:
         """Return the joint that carries a role of both sides."""
@@ -99,6 +103,12 @@ def anatomy(names: Sequence[str], parents: Sequence[int], joints: np.ndarray | N
     roles = {word: j for word, j in roles.items() if j not in trunk} | {"hips": hips}
     beside = legs is not None and legs != hips and legs not in spine and tree.carries(hips, legs)
     return Limbs(roles, spine, neck, tuple(word for word in roles if word in shaped), legs if beside else None)
+
+
+def _lone_end(role: str, above: int | None, roles: dict[str, int], read: list[Name], parents: Sequence[int]) -> dict[str, int]:
+    """Return the joint of a role that the names lack, if one alone, called anything, hangs on the joint above."""
+    on = [j for j, n in enumerate(read) if parents[j] == above and n.side in ("", role.split()[0]) and not (n.kind or n.finger)]
+    return {role: on[0]} if above is not None and role not in roles and len(on) == 1 and on[0] not in roles.values() else {}
 
 
 def _missing(named: dict[str, int], read: list[Name], parents: Sequence[int], joints: np.ndarray) -> dict[str, int]:

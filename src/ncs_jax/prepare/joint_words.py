@@ -62,7 +62,7 @@ FACE = _words(
 
 # Names in Japanese (MMD) and the Chinese ones that mean nothing else there.
 TRANSLATED = {
-    "left": "左", "right": "右", "ankle": "足首", "wrist": "手首 手腕", "toe": "つま先 足先", "elbow": "ひじ 肘",
+    "left": "左", "right": "右", "ankle": "足首", "wrist": "手首 手腕", "toe": "つま先 足先 脚趾 足趾", "elbow": "ひじ 肘",
     "knee": "ひざ 膝", "forearm": "前腕 前臂 小臂", "upperarm": "上腕 上臂 大臂", "thigh": "大腿 太もも", "shin": "小腿 すね",
     "clavicle": "鎖骨 锁骨", "arm": "腕", "shoulder": "肩", "leg": "足 脚", "hand": "手", "head": "頭 头", "neck": "首 脖子 颈",
     "spine": "上半身", "lowerbody": "下半身", "center": "センター", "groove": "グルーブ", "waist": "腰", "chest": "胸",
@@ -121,7 +121,7 @@ def _shared_letters(names: list[str]) -> int:
 def _plain(name: str) -> str:
     """Return a name without brackets and namespaces, of plain letters, in English where it is Japanese or Chinese."""
     name = BRACKETS.sub("", unicodedata.normalize("NFKC", name))
-    name = next((part for part in reversed(re.split(r"[:|/]", name)) if part), name)
+    name = next((part for part in reversed(re.split(r"[:|/]", name)) if part and not part.isdigit()), name)  # "lHand:2"
     return FOREIGN.sub(lambda found: f" {ENGLISH[found[0]]} ", name).strip()
 
 

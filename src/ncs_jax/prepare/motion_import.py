@@ -22,6 +22,7 @@ from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.reference_pose import (
     ZERO,
+    facing,
     find_reference,
     from_frame,
     is_even,
@@ -121,12 +122,12 @@ def _since_a_person(motion: MotionRecord, body: BodyRecord, spec: MotionSpec, re
         raise InputError('"auto", "zero" or the number of a frame expected', field="motion.rest", value=spec.rest)
     motion = motion if spec.up == "auto" else replace(motion, up=spec.up)
     of = paired(motion, body, spec.joints)[0]
-    person = is_person(rest_of(motion)[0], of)
-    bent = spec.rest == "auto" and person and leans(motion, of)
+    person, turned = is_person(rest_of(motion)[0], of), facing(motion, of)
+    bent = spec.rest == "auto" and person and leans(turned, of)
     if spec.rest == "zero":
         return motion
-    if spec.rest == "auto" and person and not bent and is_even(rest_of(motion)[0], of):
-        return replace(motion, uncertain={part + ZERO: by for part, by in odd_parts(motion, of).items()})
+    if spec.rest == "auto" and person and not bent and is_even(rest_of(turned)[0], of):
+        return replace(turned, uncertain={part + ZERO: by for part, by in odd_parts(turned, of).items()})
     up = motion.up or standing_axis(motion, of)
     if spec.rest == "auto":
         start = spec.frames[0] if spec.frames else 0

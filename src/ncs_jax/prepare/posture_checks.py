@@ -83,7 +83,12 @@ def _lies(f: _Figure) -> Iterator[tuple[str, str, str, str]]:
     share = float((lean > LYING[0]).mean())
     if share >= LYING[1]:
         value = f"hips to head lean by {np.median(lean):.0f} degrees, in {100 * share:.0f} % of the frames"
-        yield "the character lies down", value, "the garment falls the wrong way", 'motion.up = "z" or "y", if it should stand'
+        yield (
+            "the character lies down",
+            value,
+            "the garment falls the wrong way",
+            'motion.up = "z", "y" or "x", if it should stand',
+        )
 
 
 def _floats(f: _Figure) -> Iterator[tuple[str, str, str, str]]:

@@ -51,6 +51,7 @@ POSES = 8  # checked in every motion
 MOST = 400  # poses that are checked in all motions together
 NAMED = 6  # motions that a risk names
 CUT = re.compile(r"its header says (\d+) frames, (\d+) are there and taken(.*)")  # a note of the reader of .bvh
+SMALL = re.compile(r"its rotations are no larger than (\S+), and are read as degrees")  # another
 FLAT = 1e-4  # m; triangles that sink by less lie on flat skin
 
 
@@ -245,6 +246,14 @@ def _cut_short(record: MotionRecord, name: str, frames: tuple[int, ...]) -> Iter
             yield Risk("a file that is cut short", value, "the motion ends in its middle", "export it or copy it again", name)
 
 
+def _radians(record: MotionRecord, name: str) -> Iterator[Risk]:
+    """Yield a risk where no rotation of a .bvh is larger than half a turn in radians."""
+    for said in filter(None, map(SMALL.match, record.notes)):
+        value = f"at most {said[1]} degrees, in {name}"
+        mend = "export the rotations in degrees, or leave it where the character only stands"
+        yield Risk("joints that hardly turn", value, "the character is stiff, as rotations in radians make it", mend, name)
+
+
 def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
     """Yield a risk where poses since which motions are told had to be built, with the parts that may be wrong at most; and for
     each motion whose zero pose is bent in one part as no frame is."""
@@ -262,9 +271,14 @@ def _uncertain(motions: Mapping[str, MotionRecord]) -> Iterator[Risk]:
         parts = dict.fromkeys(part for one in built.values() for part in one)
         worst = ", ".join(f"{part} {max(one.get(part, 0) for one in built.values()):.0f}" for part in parts)
         mend = "motion.rest = the number of a frame in T-pose, A-pose, or upright with hanging arms"
-        risk = "they lean, or look up or down, by so much in all frames"
+        risk = "they lean, look up or down, or are twisted by so much in all frames"
         names = ", ".join([*built][:NAMED]) + (f" and {len(built) - NAMED} more" if len(built) > NAMED else "")
-        yield Risk("the pose at rest had to be built", f"right to about so many degrees: {worst}, in {names}", risk, mend)
+        yield Risk(
+            "the pose at rest had to be built",
+            f"right to so many degrees in nine of ten recordings: {worst}, in {names}",
+            risk,
+            mend,
+        )
 
 
 def _posture(a: Setting, name: str) -> Iterator[Risk]:
@@ -278,7 +292,7 @@ def motion_risks(a: Setting, say: Callable[[str], None] = lambda _: None) -> lis
     """Return what puts a scene at risk in its motions themselves, whatever is worn; `say` is told how far it is with many."""
     spec = a.scene.motion_file
     found = [risk for name, record in a.motions.items() for risk in _cut_short(record, name, spec(name)[1].frames)]
-    found += [risk for name, record in a.motions.items() for risk in _undriven(record, name)]
+    found += [risk for name, record in a.motions.items() for risk in (*_radians(record, name), *_undriven(record, name))]
     found += _uncertain(a.motions)
     for name in one_by_one(a.motions, "looking for what is too fast", say):
         found += [Risk(*fault, name) for fault in speed_faults(a, name)]

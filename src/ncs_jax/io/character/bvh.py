@@ -16,6 +16,7 @@ from ncs_jax.io.tables.files import text_of
 
 __all__ = ["Bvh", "read_bvh"]
 
+FEW = 20  # frames in which a person may hardly turn
 CHANNELS = {f"{axis}{kind}".lower(): (kind, i) for i, axis in enumerate("XYZ") for kind in ("position", "rotation")}
 
 
@@ -71,6 +72,7 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
     joints, note = _one_skeleton(file, every, root)
     offsets = np.array([joint.offset for joint in joints])
     poses = np.zeros((len(values), len(joints), 3))
+    largest = 0.0
     moved: dict[int, np.ndarray] = {0: np.broadcast_to(offsets[0], (len(values), 3)).copy()}
     for j, joint in enumerate(joints):
         own = values[:, joint.column : joint.column + len(joint.channels)]
@@ -78,11 +80,14 @@ def read_bvh(path: str | Path, root: str = "") -> Bvh:
         if turning:
             axes = "".join("XYZ"[joint.channels[c][1]] for c in turning)  # capitals: each about the axes turned before
             known = np.isfinite(own[:, turning]).all(axis=1)
+            largest = max(largest, float(np.abs(own[known][:, turning]).max(initial=0)))
             turns = Rotation.from_euler(axes, np.where(known[:, None], own[:, turning], 0), degrees=True).as_rotvec()
             poses[:, j] = np.where(known[:, None], turns, np.nan)
         for (kind, axis), value in zip(joint.channels, own.T, strict=True):
             if kind == "position":
                 moved.setdefault(j, np.broadcast_to(offsets[j], (len(values), 3)).copy())[:, axis] = value
+    if len(values) >= FEW and 0 < largest <= np.pi:
+        notes = [*notes, f"its rotations are no larger than {largest:.3g}, and are read as degrees"]
     return Bvh(
         file, tuple(joint.name for joint in joints), np.array([joint.parent for joint in joints], np.int32), offsets,
         np.array([joint.tip for joint in joints]), poses, moved.pop(0), fps, moved, (*note, *notes),

@@ -69,8 +69,8 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
     """Return the motion from the joint on that carries the path, with bones of constant length: see `moving_root`.
 
     A joint's positions are places on its parent that stand for its OFFSET. Positions that do not change are the OFFSET, unless
-    that is zero; positions that are nearer to zero than to the OFFSET are added to it. A joint that slides and carries nothing,
-    as a prop on a hand, is left out, unless it is called the end of a limb.
+    that is zero; positions that along the OFFSET are nearer to none of it than to all are added to it. A joint that slides and
+    carries nothing, as a prop on a hand, is left out, unless it is called the end of a limb.
     """
     if not bvh.moved:
         return bvh
@@ -80,7 +80,8 @@ def bvh_from_moving_root(bvh: Bvh) -> Bvh:
         use = given[np.isfinite(given).all(axis=1)]
         mean = use.mean(axis=0) if len(use) else offsets[j]
         off[j] = np.linalg.norm(use - mean, axis=1).max(initial=0)
-        added = bool(offsets[j].any()) and np.linalg.norm(mean) < np.linalg.norm(mean - offsets[j])
+        size = offsets[j] @ offsets[j]  # a path goes far along a short OFFSET, which then tells nothing
+        added = bool(size) and -size < mean @ offsets[j] < 0.5 * size
         places[j] = given + offsets[j] if added else given
         if not offsets[j].any() or (off[j] > 1e-3 * np.linalg.norm(offsets[j]) and not added):
             offsets[j] = mean
