@@ -465,7 +465,7 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
     )
     assert re.search("300 steps in all take about [0-9]+ minutes more$", first)
     assert last.startswith("ncs: warning: only 20 steps were taken")
-    assert last.endswith(f"--resume --minutes M goes on, with the scene that {out}/run.json keeps")
+    assert last.endswith(f"ncs train --out {out} --resume --minutes M goes on")
     with pytest.raises(SystemExit):
         main([*line, "--minutes", "1", "--steps", "30"])
 
@@ -493,9 +493,9 @@ def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, caps
     assert main(["train", str(scene), "--out", str(out), "--steps", "100"]) == 130
     said = capsys.readouterr()
     assert "stopping after these steps" in said.out and signal.getsignal(signal.SIGINT) is handler
-    assert said.err == f"ncs: interrupted; `ncs train {scene} --out '{out}' --resume` goes on from the last checkpoint\n"
+    assert said.err == f"ncs: interrupted; `ncs train --out '{out}' --resume` goes on from the last checkpoint\n"
     assert shown == [10, 20] and load_run(out).steps == 30
-    assert main(["train", str(scene), "--out", str(out), "--resume", "--steps", "40"]) == 0
+    assert main(["train", "--out", str(out), "--resume", "--steps", "40"]) == 0
     said = capsys.readouterr().out
     assert "going on from step 30" in said and "step 40/40" in said
 

@@ -1,6 +1,7 @@
 """Run folders: a run killed at any moment and resumed ends at the weights of the unbroken one."""
 
 import csv
+import json
 import os
 import shutil
 import signal
@@ -295,6 +296,47 @@ def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):
     scene.write_text(scene.read_text().replace("steps = 40", "steps = 40\nlearning_rate = 0.01"))
     with pytest.warns(InputWarning, match=r"not taken: training.learning_rate; .*weights: start "):
         train(scene, out, resume=True)
+
+
+OTHERS = {  # what a scene says that a run is resumed with, and the field that is named
+    "garment": ('file = "cloth.npz"', 'file = "other.npz"', r'garment.file: .*cloth.npz".*found .*other.npz'),
+    "shapes": ('file = "body.npz"', 'file = "body.npz"\nshapes = { smile = 1.0 }', r"body.shapes: .*where it is {}"),
+    "two": ("smoothing = 2", "smoothing = 3\nweld = 0.01", r"garment.weld: .*where it is 0.0 .*begin a new run"),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_a_run_is_not_resumed_with_another_scene(unstarted, tmp_path, plain_jax, other):
+    scene, (old, new, match) = write_scene(tmp_path, FREE), OTHERS[other]
+    shutil.copytree(unstarted, out := tmp_path / "run")
+    facts = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(facts).replace(str(unstarted.parent), str(tmp_path)))
+    assert train(scene, out, resume=True, steps=10).steps == 10
+    (wrong := tmp_path / "wrong.toml").write_text(scene.read_text().replace(old, new))
+    more = "; other too: garment.smoothing" if other == "two" else ""
+    with pytest.raises(InputError, match=rf"wrong.toml: {match}.*weights: start {out}{more}$"):
+        train(wrong, out, resume=True)
+
+
+def test_a_run_goes_on_with_its_own_scene_and_its_preset(tmp_path, plain_jax, recwarn):
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
+    with pytest.raises(InputError, match=r"scene: a scene expected"):
+        train(None, out)
+    train(load_scene(scene, "fast"), out, steps=10)
+    assert train(scene, out, steps=10, resume=True).steps == 10  # the preset is not given again
+    assert train(None, out, steps=20, resume=True).steps == 20
+    assert not [w for w in recwarn if issubclass(w.category, InputWarning)]
+
+
+def test_a_folder_of_motions_may_grow_before_a_run_is_resumed(tmp_path, plain_jax):
+    scene, out = write_scene(tmp_path, FREE.replace('files = ["swing.npz"]', 'files = ["takes"]')), tmp_path / "run"
+    (tmp_path / "takes").mkdir()
+    shutil.copy(tmp_path / "swing.npz", tmp_path / "takes" / "a.npz")
+    scene.write_text(scene.read_text().replace("validation", "#"))
+    train(scene, out, steps=10)
+    shutil.copy(tmp_path / "swing.npz", tmp_path / "takes" / "b.npz")
+    with pytest.warns(InputWarning, match=r"given otherwise now, and not taken: motion.files;"):
+        assert train(scene, out, steps=20, resume=True).steps == 20
 
 
 @pytest.fixture(scope="module")
