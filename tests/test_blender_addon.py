@@ -373,7 +373,7 @@ def test_alpha_has_keys(in_blender):
 @needs_blender
 def test_blender_stays_free_and_a_training_is_cancelled(in_blender):
     _, truth = in_blender
-    assert float(truth["check_tick"]) < 2 and str(truth["check_said"]).startswith("good")
+    assert float(truth["check_tick"]) < 2 and str(truth["check_said"]).startswith(("good", "at risk: "))
     assert float(truth["train_tick"]) < 2 and str(truth["train_said"]) == "stopped"
 
 
