@@ -23,6 +23,7 @@ from ncs_jax import io
 from ncs_jax.cli import animate, check, main, preview
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.cli.train import _TrainingBar
+from ncs_jax.errors import InputError
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.scene_checks import Risk
@@ -282,6 +283,11 @@ def test_wrong_options(capsys, arguments):
         ("animate a --out b --alpha 1,5", "--alpha: a finite number expected, found 1,5; write 1.5, with a point"),
         ("animate a --out b --adapt long", "--adapt: a number of seconds above 0 expected, found long"),
         ("train a --out b --minutes 2m", "--minutes: a number of minutes above 0 expected, found 2m"),
+        ("animate a --out b --alpha -0,5", "--alpha: a finite number expected, found -0,5; write -0.5, with a point"),
+        ("animate a --out b --alpha -3", "--alpha: a number from 0 to 10 expected, found -3; 0 is static, 1 as trained"),
+        ("evaluate a --alpha 1e3", "--alpha: a number from 0 to 10 expected, found 1e3; 0 is static, 1 as trained"),
+        ("evaluate a --alpha -inf", "--alpha: a finite number expected, found -inf"),
+        ("body --out b --betas 1 -,5", "--betas: a finite number expected, found -,5; write -.5, with a point"),
         ("animate a --out b --alpha much", "--alpha: a finite number expected, found much"),
         ("animate a --out b --refine 4,0", "--refine: a whole number from 1 expected, found 4,0"),
         ("animate a --out b --refine 4.5", "--refine: a whole number from 1 expected, found 4.5"),
@@ -300,6 +306,13 @@ def test_numbers_that_are_none_say_how_they_are_written(capsys, line, words):
     with pytest.raises(SystemExit) as stop:
         main(line.split())
     assert stop.value.code == 2 and f"argument {words}" in capsys.readouterr().err
+
+
+def test_python_refuses_the_alpha_that_the_commands_refuse(run_folder):
+    run = load_run(run_folder[1])
+    for measured in (run.animate, run.evaluate):
+        with pytest.raises(InputError, match=r"alpha: a number from 0 to 10 expected \(found 150\)"):
+            measured(run.assembly.scene.motions[0], 150)
 
 
 def test_hosts_that_cannot_be_joined(capsys):
