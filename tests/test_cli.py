@@ -166,6 +166,22 @@ def no_such_joint(folder, scene):
     return ["scene.toml", "body.joints[0]", "2", "0 to 1"]
 
 
+def missing_motion(folder, scene):
+    edited(scene, 'files = ["swing.npz"]', 'files = ["swung.npz"]')
+    return ["scene.toml: motion.files: no such file or folder (found 'swung.npz')", "seen from"]
+
+
+def missing_body(folder, scene):
+    (folder / "body.npz").unlink()
+    return ["scene.toml: body.file: no such file or folder (found 'body.npz')"]
+
+
+def a_garment_as_the_body(folder, scene):
+    (folder / "dress.obj").write_text("v 0 0 0\n")
+    edited(scene, 'file = "body.npz"', 'file = "dress.obj"')
+    return ["dress.obj: body.file: a character with skeleton", "they are the garment, and the body is ncs:body"]
+
+
 def no_such_pins(folder, scene):
     edited(scene, "smoothing = 2", 'pins = "collar"')
     return ["scene.toml", "garment.pins", "collar", "pins"]
@@ -190,6 +206,9 @@ BROKEN = [
     translation_in_centimetres,
     no_such_joint,
     no_such_pins,
+    missing_motion,
+    missing_body,
+    a_garment_as_the_body,
 ]
 
 

@@ -339,6 +339,27 @@ def test_a_folder_of_motions_may_grow_before_a_run_is_resumed(tmp_path, plain_ja
         assert train(scene, out, steps=20, resume=True).steps == 20
 
 
+CHANGED = {  # in the scene of a run that is trained, and the field that is named
+    "decoder": ("network", {"decoder": [32]}, r"network.decoder: .*\(16,\) for decoder.layers_0.bias \(found \(32,\)\)"),
+    "deeper": ("network", {"static": [16, 16, 16]}, r"network.static: .*no array for static.layer_2.bias"),
+    "descriptor": ("network", {"descriptor": "axis_angle"}, r"network.descriptor, or body.joints: "),
+    "cell": ("network", {"cell": "linear"}, r"network.dynamic, joint or cell: "),
+    "method": ("network", {"method": "pbns"}, r"network.method, or garment.learn_weights: "),
+    "modes": ("network", {"modes": 4}, r"network.modes, or garment.file: .*shape \(30, 6\) \(found \(30, 4\)\)"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGED)
+def test_a_scene_that_was_changed_in_a_run_is_named(unstarted, tmp_path, plain_jax, change):
+    shutil.copytree(unstarted, out := tmp_path / "run")
+    (table, values, match), facts = CHANGED[change], read_run(out)
+    facts["scene"][table] |= values
+    write_run(out, facts)
+    with pytest.raises(InputError, match=rf"run.json: scene: {match}.*; the scene, or a file that it names, was changed"):
+        train(None, out, steps=20, resume=True) if change == "modes" else load_run(out)
+    assert Checkpoints(out).latest() == 10
+
+
 @pytest.fixture(scope="module")
 def unstarted(tmp_path_factory):
     """A run to begin others from."""

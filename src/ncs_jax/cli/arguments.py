@@ -43,6 +43,7 @@ BLENDER = (
     "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
 )
 OPTIONS = {
+    "body.file": "--body",
     **{f"body.{name}": f"--{name}" for name in ("part", "betas")},
     **{f"body.{name}": f"--body-{name}" for name in ("scale", "up", "fps", "mesh")},
     **{f"garment.{name}": f"--{name}" for name in ("mesh", "scale", "up", "weld")},

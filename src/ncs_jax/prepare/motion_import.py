@@ -33,6 +33,7 @@ from ncs_jax.prepare.reference_pose import (
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.motion_lists import LISTING
+from ncs_jax.scene.motion_names import LISTS, split_frames
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
@@ -304,6 +305,9 @@ def _by_kind(faults: Mapping[str, InputError]) -> str:
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
     """Read a motion of the scene for its body, see `retarget_to_body`, and resample it to the scene's frame rate."""
     path, spec = scene.motion_file(name)
+    for key in () if scene.motion.lone else LISTS:
+        if name in getattr(scene.motion, key):
+            scene.there(split_frames(name)[0], f"motion.{key}")
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
     if path.suffix.lower() in ("", *LISTING) and not path.exists():  # else its suffix would be at fault

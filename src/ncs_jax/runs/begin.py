@@ -53,7 +53,9 @@ def assemble_run(
         return _assemble_started(start, scene, network, functools.partial(make_ready, ahead=None))
     assembly = make_ready(scene)
     if facts is not None and out is not None and (out / "prepared.npz").exists():  # of what it has learned: not found anew
-        assembly = _with_fields_of(read_prepared(out), assembly)
+        kept = read_prepared(out)
+        _check_prepared(out, kept, assembly.prepared)
+        assembly = _with_fields_of(kept, assembly)
     return assembly, None
 
 
@@ -110,6 +112,19 @@ def resumed_scene(facts: dict, out: Path, scene: Scene | None, seed: int | None,
     if scene is not None:
         _check_same_scene(facts, out, kept, scene)
     return kept
+
+
+def _check_prepared(out: Path, kept: Prepared, found: Prepared) -> None:
+    """Raise an InputError where what a run keeps of its garment is of another size than what its scene gives now."""
+    for name, field in (("basis", "network.modes, or garment.file"), ("vibrations", "network.cell, or network.vibrations")):
+        shapes = [getattr(prepared, name).shape for prepared in (kept, found)]
+        apart = shapes[0] != shapes[1] if name == "basis" else (0 in shapes[0]) != (0 in shapes[1])
+        if apart:
+            raise InputError(
+                f"the garment that was trained expected, with {name} of shape {shapes[0]}", file=out / "run.json",
+                field=f"scene: {field}", value=shapes[1],
+                mend="the scene, or a file that it names, was changed since: change it back, or train anew into another folder",
+            )  # fmt: skip
 
 
 def _check_same_scene(facts: dict, out: Path, kept: Scene, scene: Scene) -> None:

@@ -26,6 +26,7 @@ from ncs_jax.prepare.build import Assembly, features_from_records, tell_a_person
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import Model
+from ncs_jax.scene.motion_names import split_frames
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.simulation.implicit_euler import SimulationState, Simulator, simulator_from, stepper
 from ncs_jax.simulation.solver.minimise import Settings, Solution
@@ -147,6 +148,8 @@ def simulate(
     scene = load_scene(scene) if isinstance(scene, str | Path) else scene
     named = (*scene.motion.files, *scene.motion.validation)
     name = motion or (named[0] if named else None)
+    if motion is None and name is not None:
+        scene.there(split_frames(name)[0], "motion." + ("files" if scene.motion.files else "validation"))
     if name is not None and not name.startswith("ncs:") and name not in named:
         name = str(Path(name).absolute())
     fine = scene.motion.fps * scene.simulation.substeps

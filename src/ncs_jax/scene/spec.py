@@ -252,6 +252,18 @@ class Scene:
         path = Path(name).expanduser()
         return path if path.is_absolute() or not self.source else Path(self.source).parent / path
 
+    def there(self, name: str, field: str) -> Path:
+        """Return the path of a file that a field of this scene names.
+
+        Raises:
+            InputError: there is none.
+        """
+        path = self.path(name)
+        if name.startswith("ncs:") or path.exists() or ("#" in path.name and Path(str(path).rpartition("#")[0]).exists()):
+            return path  # the file, or an animation in it
+        seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent}"
+        raise InputError("no such file or folder", file=self.source, field=field, value=name, mend=f"check the path{seen}")
+
     def motion_file(self, name: str) -> tuple[Path, MotionSpec]:
         """Return the path of a motion, and its settings: the scene's, but for frames in its name and `own_settings`."""
         file, frames = split_frames(name)
