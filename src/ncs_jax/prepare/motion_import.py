@@ -318,10 +318,10 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
             partial(_frames, record) if chosen is None else lambda start, stop: io.read_motion(path, frame_range=(start, stop))
         )
         count, absent = len(record.poses), _absent(record, spec.joints)
+        record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
         if chosen and spec.frames is scene.motion.frames:
             said = "from {} on" if chosen[1] is None else "from {} to before {}"
             record = replace(record, notes=(*record.notes, f"frames {said.format(*chosen)}, as motion.frames says"))
-        record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
     except InputError as error:
         if error.file is not None:
             raise

@@ -279,14 +279,15 @@ def _alone(ocp):
 def _quiet():
     """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    log = logging.getLogger("asyncio")
-    level = log.level
-    log.setLevel(logging.CRITICAL + 1)
+    logs = {log: log.level for log in map(logging.getLogger, ("asyncio", "absl"))}
+    for log in logs:
+        log.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        log.setLevel(level)
+        for log, level in logs.items():
+            log.setLevel(level)
 
 
 def _let_go(seconds: float = 1.0) -> None:
