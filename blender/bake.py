@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from . import commands
-from .export import Names, at_rest, frames_kept, mesh_of, pose_now, read_skeleton, shape_modifiers, write_motion
+from .export import Names, at_rest, frames_kept, mesh_of, posed_frames, read_skeleton, shape_modifiers, write_motion
 from .pose import Wrong, from_metres
 from .process import warnings
 from .tasks import Command
@@ -41,12 +41,8 @@ def bake(names: Names, command: list[str], trained: Path):
     count = garment_vertices(names)
     poses, places, alphas, told = [], [], [], ""
     with frames_kept(names):
-        for frame in range(first, last + 1):
-            names.scene_now().frame_set(frame)
-            try:
-                poses.append(pose_now(names.evaluated("armature"), skeleton))
-            except Wrong as wrong:
-                raise Wrong(f"frame {frame}: {wrong}") from None
+        for frame, pose in posed_frames(names, skeleton, first, last):
+            poses.append(pose)
             places.append(np.array(names.evaluated("garment").matrix_world))
             alphas.append(names.scene_now().evaluated_get(names.layer_now().depsgraph).ncs.alpha)
             yield f"reading frame {frame} of {last}"

@@ -295,19 +295,29 @@ def give(data, action, slot) -> None:
         data.action_slot = slot or data.action_slot or next(iter(data.action_suitable_slots), None)
 
 
+def posed_frames(names: Names, skeleton: Skeleton, first: int, last: int):
+    """Yield every frame of the scene's, shown, with the armature's pose in it."""
+    for frame in range(first, last + 1):
+        names.scene_now().frame_set(frame)
+        try:
+            pose = pose_now(names.evaluated("armature"), skeleton)
+        except Wrong as wrong:
+            raise Wrong(f"frame {frame}: {wrong}") from None
+        yield frame, pose
+
+
 def write_action(names: Names, action_name: str, skeleton: Skeleton, file: Path):
     """Write an action, frame by frame; yield what is done in between."""
     action = bpy.data.actions[action_name]
     first, last = math.floor(action.frame_range[0]), math.ceil(action.frame_range[1])
     poses = []
     with frames_kept(names), playing(names, action):
-        for frame in range(first, last + 1):
-            names.scene_now().frame_set(frame)
-            try:
-                poses.append(pose_now(names.evaluated("armature"), skeleton))
-            except Wrong as wrong:
-                raise Wrong(f"{action_name}, frame {frame}: {wrong}") from None
-            yield f"reading {action_name}, frame {frame} of {last}"
+        try:
+            for frame, pose in posed_frames(names, skeleton, first, last):
+                poses.append(pose)
+                yield f"reading {action_name}, frame {frame} of {last}"
+        except Wrong as wrong:
+            raise Wrong(f"{action_name}, {wrong}") from None
     write_motion(file, poses, skeleton, names.fps())
 
 

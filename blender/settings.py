@@ -42,7 +42,7 @@ class NCS_Settings(bpy.types.PropertyGroup):
     )
     alpha: FloatProperty(
         name="Alpha", description="How much the garment moves: 0 static, 1 as trained, more exaggerates",
-        default=1.0, soft_min=0.0, soft_max=2.0, options={"ANIMATABLE"},
+        default=1.0, min=0.0, max=10.0, soft_max=2.0, options={"ANIMATABLE"},
         update=lambda self, context: self.id_data.update_tag(),  # or Blender would evaluate the last one
     )  # fmt: skip
     folder: StringProperty(

@@ -24,7 +24,7 @@ def checked(context):
     text = yield Command([*ncs, *commands.check()], folder, "Neural Cloth: Check")
     picture(folder / "check.png")
     risks = text.count("  at risk ")
-    return f"good, but at risk: {risks}; see the text Neural Cloth: Check" if risks else "good"
+    return f"at risk: {risks}; see the text Neural Cloth: Check" if risks else "good"
 
 
 def fitted(context):

@@ -7,56 +7,25 @@ as Mixamo's are, and its bones have rolls of their own.
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Euler, Matrix, Vector
+from blender_character import UP, rigged
+from mathutils import Euler
 
 FRAMES = 25  # at 24 a second
-UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # Blender's Z up to Y up
 
 
 def build(folder: Path, body: dict) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.fps, scene.frame_start, scene.frame_end = 24, 0, FRAMES - 1
-    place = Matrix.Translation((0.3, 0.2, 0)) @ Matrix.Rotation(math.radians(90), 4, "X") @ Matrix.Scale(0.01, 4)
-    inner = np.array(place.inverted())
-
-    def inside(points):
-        """Points (n, 3), m, Y up, in the armature's own space."""
-        return (points @ UP) @ inner[:3, :3].T + inner[:3, 3]
-
     names = [str(n) for n in body["joint_names"]]
-    joints = inside(body["joints"])
-    armature = bpy.data.objects.new("Armature", bpy.data.armatures.new("Armature"))
-    scene.collection.objects.link(armature)
-    armature.matrix_world = place
-    bpy.context.view_layer.objects.active = armature
-    bpy.ops.object.mode_set(mode="EDIT")
-    for j, name in enumerate(names):
-        bone = armature.data.edit_bones.new(name)
-        child = next((c for c, p in enumerate(body["parents"]) if p == j), None)
-        bone.head = Vector(joints[j])
-        bone.tail = Vector(joints[child] if child is not None else joints[j] + [0, 8.0, 0])
-        bone.roll = 0.1 * j
-        if j:
-            bone.parent = armature.data.edit_bones[names[body["parents"][j]]]
-    bpy.ops.object.mode_set(mode="OBJECT")
-    mesh = bpy.data.meshes.new("Skin")
-    mesh.from_pydata(inside(body["vertices"]).tolist(), [], body["faces"].tolist())
-    mesh.uv_layers.new().data.foreach_set("uv", np.random.default_rng(0).random(2 * len(mesh.loops)))  # every corner a seam
-    skin = bpy.data.objects.new("Skin", mesh)
-    scene.collection.objects.link(skin)
-    skin.parent = armature
-    skin.modifiers.new("Armature", "ARMATURE").object = armature
-    for j, name in enumerate(names):
-        group = skin.vertex_groups.new(name=name)
-        for v, k in np.argwhere((body["weight_joints"] == j) & (body["weights"] > 0)).tolist():
-            group.add([v], float(body["weights"][v, k]), "ADD")
+    skin, armature = rigged(body)
+    uv = skin.data.uv_layers.new().data
+    uv.foreach_set("uv", np.random.default_rng(0).random(2 * len(skin.data.loops)))  # every corner a seam
     rest = posed(skin)
     animate(armature, names)
     truth = []

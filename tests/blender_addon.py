@@ -17,11 +17,11 @@ from typing import Any
 
 import bpy
 import numpy as np
+from blender_character import UP, rigged
 from mathutils import Euler, Matrix, Vector
 
 FIRST, LAST = 1, 24
 UNIT = 0.5  # m
-UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # Blender's Z up to Y up
 TURNS = {  # of the two actions: bone, axis, radians
     "Armature|mixamo.com|Layer0": {"LeftUpLeg": (0, 0.5), "RightUpLeg": (0, -0.5), "Spine": (1, 0.2), "LeftArm": (2, 0.3)},
     "Turn": {"Spine": (1, -0.5), "Hips": (1, 0.4), "RightArm": (2, 0.5)},
@@ -40,39 +40,6 @@ batch = 4
 window = 5
 checkpoint_every = 10
 """
-
-
-def character(body: dict):
-    """The packaged body on a Mixamo-style armature."""
-    place = Matrix.Translation((0.3, 0.2, 0)) @ Matrix.Rotation(math.radians(90), 4, "X") @ Matrix.Scale(0.01 / UNIT, 4)
-    inner = np.array(place.inverted())
-    names = [f"mixamorig:{n}" for n in body["joint_names"].tolist()]
-    joints, vertices = ((body[k] @ UP / UNIT) @ inner[:3, :3].T + inner[:3, 3] for k in ("joints", "vertices"))
-    armature = bpy.data.objects.new("Armature", bpy.data.armatures.new("Armature"))
-    bpy.context.scene.collection.objects.link(armature)
-    armature.matrix_world = place
-    bpy.context.view_layer.objects.active = armature
-    bpy.ops.object.mode_set(mode="EDIT")
-    for j, name in enumerate(names):
-        bone = armature.data.edit_bones.new(name)
-        child = next((c for c, p in enumerate(body["parents"]) if p == j), None)
-        bone.head = Vector(joints[j])
-        bone.tail = Vector(joints[child] if child is not None else joints[j] + [0, 8.0, 0])
-        bone.roll = 0.1 * j
-        if j:
-            bone.parent = armature.data.edit_bones[names[body["parents"][j]]]
-    bpy.ops.object.mode_set(mode="OBJECT")
-    mesh = bpy.data.meshes.new("Skin")
-    mesh.from_pydata(vertices.tolist(), [], body["faces"].tolist())
-    skin = bpy.data.objects.new("Skin", mesh)
-    bpy.context.scene.collection.objects.link(skin)
-    skin.parent = armature
-    skin.modifiers.new("Armature", "ARMATURE").object = armature
-    for j, name in enumerate(names):
-        group = skin.vertex_groups.new(name=name)
-        for v, k in np.argwhere((body["weight_joints"] == j) & (body["weights"] > 0)).tolist():
-            group.add([v], float(body["weights"][v, k]), "ADD")
-    return skin, armature
 
 
 def dress(file: dict):
@@ -276,7 +243,7 @@ def main(folder: Path, assets: Path, packed: str, command: str) -> None:
     preferences = enabled(packed, command)
     fine = "--fine" in sys.argv
     with np.load(assets / "body.npz") as body, np.load(assets / ("dress_fine.npz" if fine else "dress.npz")) as file:
-        skin, armature = character(dict(body))
+        skin, armature = rigged(dict(body), UNIT, "mixamorig:")
         garment = dress(dict(file))
     actions(armature)
     scene, found = bpy.context.scene, dict[str, Any]()

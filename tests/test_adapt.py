@@ -13,11 +13,13 @@ import pytest
 from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.errors import InputError
+from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs import adapt as module
 from ncs_jax.runs.adapt import adapt, adapted_folder
 from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
+from ncs_jax.scene.spec import scene_from
 
 from .ready import assembled
 from .scenes import FREE, swing, write_scene
@@ -104,6 +106,14 @@ def test_what_comes_out_worse_is_not_kept(trained, tmp_path, monkeypatch):
     assert not found.kept and found.after == found.before and "the weights of the run are kept" in str(found)
     assert same(found.run, run) and same(load_run(out), run) and load_run(out).steps == 10
     assert not adapt(run, str(trained / "clip.npz"), MOMENT, out, report=pytest.fail).kept
+
+
+def test_a_clip_is_adapted_to_as_a_whole(trained):
+    run = load_run(trained / "run")
+    a = replace(run.assembly, scene=scene_from({**run.assembly.scene.to_dict(), "motion": {"frames": [0, 10], "fps": 30.0}}))
+    on, records = module._scene_on(replace(run, assembly=a), str(trained / "clip.npz"))
+    again = scene_from(on.to_dict())  # as its run.json has it
+    assert [len(r.poses) for r in (*records.values(), load_motion(again, on.motions[0], a.body))] == [40, 40]
 
 
 def test_motions_fill_whole_blocks():

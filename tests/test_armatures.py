@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
+from ncs_jax.io.character.rig import quarter_turns
 from ncs_jax.io.character.rig_motion import carries_limb
 from ncs_jax.prepare.motion_import import retarget_to_body
 from ncs_jax.scene.spec import MotionSpec
@@ -180,3 +181,10 @@ def test_which_joints_carry_a_limb():
     expected = [True, True, True, False, False, True, True, False]
     assert carries_limb(names, parents).tolist() == expected
     assert carries_limb(("a", "b"), np.array([-1, 0])).tolist() == [True, True]  # names that tell nothing
+
+
+def test_the_quarter_turns_are_all_rotations_of_a_cube_the_identity_first():
+    found = quarter_turns()
+    np.testing.assert_array_equal(found[0], np.eye(3))
+    cube = np.round(Rotation.create_group("O").as_matrix())
+    assert sorted(found.reshape(24, 9).tolist()) == sorted(cube.reshape(24, 9).tolist())

@@ -23,6 +23,7 @@ from ncs_jax import io
 from ncs_jax.cli import animate, check, main, preview
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.cli.train import _TrainingBar
+from ncs_jax.errors import InputError
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.scene_checks import Risk
@@ -165,6 +166,22 @@ def no_such_joint(folder, scene):
     return ["scene.toml", "body.joints[0]", "2", "0 to 1"]
 
 
+def missing_motion(folder, scene):
+    edited(scene, 'files = ["swing.npz"]', 'files = ["swung.npz"]')
+    return ["scene.toml: motion.files: no such file or folder (found 'swung.npz')", "seen from"]
+
+
+def missing_body(folder, scene):
+    (folder / "body.npz").unlink()
+    return ["scene.toml: body.file: no such file or folder (found 'body.npz')"]
+
+
+def a_garment_as_the_body(folder, scene):
+    (folder / "dress.obj").write_text("v 0 0 0\n")
+    edited(scene, 'file = "body.npz"', 'file = "dress.obj"')
+    return ["dress.obj: body.file: a character with skeleton", "they are the garment, and the body is ncs:body"]
+
+
 def no_such_pins(folder, scene):
     edited(scene, "smoothing = 2", 'pins = "collar"')
     return ["scene.toml", "garment.pins", "collar", "pins"]
@@ -189,6 +206,9 @@ BROKEN = [
     translation_in_centimetres,
     no_such_joint,
     no_such_pins,
+    missing_motion,
+    missing_body,
+    a_garment_as_the_body,
 ]
 
 
@@ -282,6 +302,11 @@ def test_wrong_options(capsys, arguments):
         ("animate a --out b --alpha 1,5", "--alpha: a finite number expected, found 1,5; write 1.5, with a point"),
         ("animate a --out b --adapt long", "--adapt: a number of seconds above 0 expected, found long"),
         ("train a --out b --minutes 2m", "--minutes: a number of minutes above 0 expected, found 2m"),
+        ("animate a --out b --alpha -0,5", "--alpha: a finite number expected, found -0,5; write -0.5, with a point"),
+        ("animate a --out b --alpha -3", "--alpha: a number from 0 to 10 expected, found -3; 0 is static, 1 as trained"),
+        ("evaluate a --alpha 1e3", "--alpha: a number from 0 to 10 expected, found 1e3; 0 is static, 1 as trained"),
+        ("evaluate a --alpha -inf", "--alpha: a finite number expected, found -inf"),
+        ("body --out b --betas 1 -,5", "--betas: a finite number expected, found -,5; write -.5, with a point"),
         ("animate a --out b --alpha much", "--alpha: a finite number expected, found much"),
         ("animate a --out b --refine 4,0", "--refine: a whole number from 1 expected, found 4,0"),
         ("animate a --out b --refine 4.5", "--refine: a whole number from 1 expected, found 4.5"),
@@ -300,6 +325,13 @@ def test_numbers_that_are_none_say_how_they_are_written(capsys, line, words):
     with pytest.raises(SystemExit) as stop:
         main(line.split())
     assert stop.value.code == 2 and f"argument {words}" in capsys.readouterr().err
+
+
+def test_python_refuses_the_alpha_that_the_commands_refuse(run_folder):
+    run = load_run(run_folder[1])
+    for measured in (run.animate, run.evaluate):
+        with pytest.raises(InputError, match=r"alpha: a number from 0 to 10 expected \(found 150\)"):
+            measured(run.assembly.scene.motions[0], 150)
 
 
 def test_hosts_that_cannot_be_joined(capsys):
@@ -341,7 +373,8 @@ def test_check_says_what_is_in_a_scene_and_draws_it(tmp_path, capsys, monkeypatc
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(scene)]) == 0
     text, progress = capsys.readouterr()
-    for word in ("good", "30 vertices", "40 triangles", "membrane, bending, collision, gravity, inertia (stvk)", "24 frames"):
+    words = "30 vertices", "40 triangles", "membrane, bending, collision, gravity, inertia (stvk)", "24 frames"
+    for word in ("at risk: 1 in", *words):
         assert word in text
     assert "picture   check.png: each motion" in text
     with Image.open(tmp_path / "check.png") as picture:
@@ -361,7 +394,7 @@ def test_check_warns_first_and_is_worth_as_much_without_its_picture(tmp_path, ca
     np.savez(tmp_path / "cloth.npz", vertices=vertices, faces=faces)
     assert main(["check", str(scene), "--out", str(scene / "check.png")]) == 0  # a file is no folder
     lines = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r".*scene.toml: good, but at risk: [1-9]", lines[0])
+    assert re.fullmatch(r"at risk: [1-9] in .*scene.toml", lines[0]) and "good" not in lines[0]
     assert lines[1].startswith("  at risk") and "inside the body" in "".join(lines)
     risks = [i for i, line in enumerate(lines) if line.startswith("  at risk")]
     assert max(risks) < next(i for i, line in enumerate(lines) if line.startswith("  garment"))
@@ -465,7 +498,7 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
     )
     assert re.search("300 steps in all take about [0-9]+ minutes more$", first)
     assert last.startswith("ncs: warning: only 20 steps were taken")
-    assert last.endswith(f"--resume --minutes M goes on, with the scene that {out}/run.json keeps")
+    assert last.endswith(f"ncs train --out {out} --resume --minutes M goes on")
     with pytest.raises(SystemExit):
         main([*line, "--minutes", "1", "--steps", "30"])
 
@@ -493,9 +526,9 @@ def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, caps
     assert main(["train", str(scene), "--out", str(out), "--steps", "100"]) == 130
     said = capsys.readouterr()
     assert "stopping after these steps" in said.out and signal.getsignal(signal.SIGINT) is handler
-    assert said.err == f"ncs: interrupted; `ncs train {scene} --out '{out}' --resume` goes on from the last checkpoint\n"
+    assert said.err == f"ncs: interrupted; `ncs train --out '{out}' --resume` goes on from the last checkpoint\n"
     assert shown == [10, 20] and load_run(out).steps == 30
-    assert main(["train", str(scene), "--out", str(out), "--resume", "--steps", "40"]) == 0
+    assert main(["train", "--out", str(out), "--resume", "--steps", "40"]) == 0
     said = capsys.readouterr().out
     assert "going on from step 30" in said and "step 40/40" in said
 

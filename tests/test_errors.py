@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 
+import numpy as np
 import pytest
 
 import ncs_jax
 from ncs_jax.cli import main
 from ncs_jax.cli.parser import _show_warning
-from ncs_jax.errors import InputError, InputWarning, for_python
+from ncs_jax.errors import InputError, InputWarning, check_alpha, for_python
 
 
 @pytest.mark.parametrize(
@@ -41,3 +42,11 @@ def test_the_same_mistake_in_python_and_on_the_command_line(tmp_path, capsys):
         ncs_jax.train("ncs:tshirt", tmp_path)
     assert main(["train", "ncs:tshirt", "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err.endswith("add --resume, or choose another --out\n")
+
+
+@pytest.mark.parametrize("alpha", [-0.1, 10.5, float("nan"), float("inf")])
+def test_alpha_from_0_to_10_is_meant(alpha):
+    with pytest.raises(InputError, match=r"^alpha: a number from 0 to 10 expected \(found .*\); 0 is static, 1 as trained"):
+        check_alpha(alpha)
+    check_alpha(0)
+    check_alpha(np.float32(10.0))

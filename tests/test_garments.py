@@ -13,6 +13,7 @@ from ncs_jax.cli import main
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import upright
 from ncs_jax.io.mesh.polygons import triangulate
+from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.garment_checks import check_on_body, summarise_surface
 
 from .scenes import grid, post, write_scene
@@ -322,6 +323,16 @@ def test_units_and_axes_are_recognised_and_the_mend_holds(tmp_path, unit, up):
     read = io.read_garment(tmp_path / "g.npz", scale=0.0 if unit == 1 else 1 / unit, up="" if up == "y" else up)
     np.testing.assert_allclose(read.vertices, x, atol=1e-12)
     check_on_body(tmp_path / "g.npz", read, body, axis_given=False)
+
+
+@pytest.mark.parametrize("told", [0.0, 1.0, 0.3048])
+def test_every_unit_that_would_suit_is_offered_the_likeliest_first(tmp_path, told):
+    """In inches a T-shirt lies where it is worn; in centimetres it would hang at the knees, and its box cannot tell."""
+    shirt, body = io.read_garment(packaged("tshirt")), io.read_body(packaged("body")).vertices
+    np.savez(tmp_path / "g.npz", vertices=shirt.vertices / 0.0254, faces=shirt.faces)
+    read = io.read_garment(tmp_path / "g.npz", scale=told)
+    with pytest.raises(InputError, match=r"suit inches or centimetres: whichever it is, write scale = 0.0254 or 0.01 below"):
+        check_on_body(tmp_path / "g.npz", read, body, axis_given=False, scale_given=bool(told))
 
 
 def test_the_command_tells_the_mend_and_then_what_was_applied(tmp_path, capsys):

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ncs_jax import io
@@ -751,6 +752,13 @@ def test_missing_files_and_folders(tmp_path, read):
     (tmp_path / "folder.npz").mkdir()
     with pytest.raises(InputError, match=r"folder\.npz: a file expected"):
         read(str(tmp_path / "folder.npz"))
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.stl", "a.glb", "a.fbx", "a.npz"])
+def test_a_picture_by_another_name(tmp_path, name):
+    Image.new("RGB", (20, 20)).save(tmp_path / name, "PNG")
+    with pytest.raises(InputError, match=rf"{name}: a \.\w+ expected, by what is in it \(found 'a PNG picture'\)"):
+        io.read_garment(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.glb", "a.usdc", "a", "deep/a.npz"])

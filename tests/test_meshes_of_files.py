@@ -293,10 +293,10 @@ def test_a_body_under_another_suffix(tmp_path):
     path.rename(tmp_path / "hero.VRM")
     body, motion = io.read_body(tmp_path / "hero.VRM"), io.read_motion(f"{tmp_path}/hero.VRM#walk")
     assert body.joint_names == motion.joint_names == NAMES
-    alone = "a mesh alone has no skin"
+    alone = "a mesh alone has none"
     for suffix, words in {".obj": alone, ".usdz": alone, ".blend": "convert it", "": "convert it"}.items():
         (tmp_path / f"body{suffix}").write_text("x")
-        with pytest.raises(InputError, match=rf"one of \.npz, \.glb, \.vrm, \.gltf, \.fbx expected.*{words}"):
+        with pytest.raises(InputError, match=rf"body.file: .*weights expected, \.npz, \.glb, \.vrm, \.gltf, \.fbx.*{words}"):
             io.read_body(tmp_path / f"body{suffix}")
 
 
@@ -312,8 +312,11 @@ def test_gltf_that_was_renamed_is_read_as_what_it_is(tmp_path, suffix):
     for name in ("text.gltf", "binary.gltf", f"text{suffix}"):
         np.testing.assert_array_equal(io.read_body(tmp_path / name).vertices, right.vertices)
     (tmp_path / f"page{suffix}").write_bytes(b"<!DOCTYPE html><html></html>")
-    with pytest.raises(InputError, match="begins with 'glTF' expected"):
+    with pytest.raises(InputError, match="found 'a web page'"):
         io.read_body(tmp_path / f"page{suffix}")
+    (tmp_path / f"other{suffix}").write_bytes(b"else")
+    with pytest.raises(InputError, match="begins with 'glTF' expected"):
+        io.read_body(tmp_path / f"other{suffix}")
 
 
 def test_packaged_files_have_their_short_names():

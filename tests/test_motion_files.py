@@ -322,6 +322,33 @@ def test_frames_of_a_file_override_those_of_the_scene(given, chosen):
     assert again.motion == one.motion and again.to_dict() == one.to_dict()
 
 
+STRANGERS = {  # beside a scene of ncs:walk with frames, scale and joints: frames and scale that a motion is read with
+    "ncs:dance": ((), 0.0),
+    "ncs:dance[4:9]": ((4, 9), 0.0),
+    "ncs:walk[0:]": ((0,), 0.5),
+    "ncs:walk": ((2, 40), 0.25),
+    "take.bvh": ((), 0.25),
+    "below/../b.bvh": ((2, 40), 0.75),
+    "a.bvh[1:3]": ((1, 3), 2.0),
+}
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_frames_of_the_scene_are_of_its_own_files_alone(name):
+    own = [{"file": "ncs:walk[:5]", "scale": 0.5}, {"file": "a.bvh", "scale": 2.0}, {"file": "b.bvh", "scale": 0.75}]
+    one = scene([*own, "ncs:walk"], frames=[2, 40], scale=0.25, joints={"a": "b"})
+    _, spec = one.motion_file(name)
+    assert (spec.frames, spec.scale, spec.joints) == (*STRANGERS[name], {"a": "b"})
+
+
+def test_a_motion_beside_the_scenes_is_whole():
+    one, body = scene(["ncs:walk"], frames=[2, 40]), io.read_body(packaged("body"))
+    assert len(load_motion(one, "ncs:dance", body).poses) == len(io.read_motion(packaged("dance")).poses)
+    cut = load_motion(one, "ncs:walk", body)
+    assert len(cut.poses) == 38 and cut.notes[-1] == "frames from 2 to before 40, as motion.frames says"
+    assert not any("motion.frames" in note for note in load_motion(one, "ncs:walk[2:40]", body).notes)
+
+
 def test_a_table_sets_scale_up_and_joints_of_one_file_alone(tmp_path):
     for name in ("a", "b"):
         (tmp_path / f"{name}.bvh").write_text(PLAIN)

@@ -336,12 +336,23 @@ def test_poses_along_the_joints_own_axes_are_the_same_motion(rng):
     np.testing.assert_allclose(retarget_to_body(along, turned, MotionSpec()).poses, along.poses, atol=1e-12)
 
 
+def test_another_creature_is_refused_in_few_words(rng):
+    motion = motion_of("mixamo", rng)
+    names = ("Body", *(f"Segment{j}" for j in range(59)))
+    chain = np.stack([np.zeros(60), np.zeros(60), 0.1 * np.arange(60)], axis=1)
+    poses = np.zeros((len(motion.poses), 60, 3))
+    fish = replace(motion, poses=poses, joint_names=names, joints=chain, parents=np.arange(-1, 59), bones=())
+    with pytest.raises(InputError, match=r"found '60 joints, Body, Segment0, Segment1, Segment2, ...'\)") as told:
+        retarget(fish, body_of("mixamo"))
+    assert len(str(told.value)) < 800 and 'joints = { "Body" = ' in str(told.value)
+
+
 def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
     motion = motion_of("poser", rng)  # without toes nothing says what is ahead, and so which side is which
     foreign = replace(motion, joint_names=tuple(f"bone {j}" for j in range(len(motion.joint_names))))
     keys = figure("mixamo")[3]
     body = body_of("poser", droop=0.6)
-    with pytest.raises(InputError, match=r"joint_names: joint names that say .*motion.joints.*hip, "):
+    with pytest.raises(InputError, match=r"^motion.joints: joints that are a body's .*bone 3, \.\.\..*hip.*below \[motion\]$"):
         retarget(foreign, body)
     told = dict(zip(foreign.joint_names, body.joint_names, strict=True))
     expected = retarget(motion, body).motion

@@ -1,6 +1,7 @@
 """Run folders: a run killed at any moment and resumed ends at the weights of the unbroken one."""
 
 import csv
+import json
 import os
 import shutil
 import signal
@@ -297,6 +298,68 @@ def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):
     scene.write_text(scene.read_text().replace("steps = 40", "steps = 40\nlearning_rate = 0.01"))
     with pytest.warns(InputWarning, match=r"not taken: training.learning_rate; .*weights: start "):
         train(scene, out, resume=True)
+
+
+OTHERS = {  # what a scene says that a run is resumed with, and the field that is named
+    "garment": ('file = "cloth.npz"', 'file = "other.npz"', r'garment.file: .*cloth.npz".*found .*other.npz'),
+    "shapes": ('file = "body.npz"', 'file = "body.npz"\nshapes = { smile = 1.0 }', r"body.shapes: .*where it is {}"),
+    "two": ("smoothing = 2", "smoothing = 3\nweld = 0.01", r"garment.weld: .*where it is 0.0 .*begin a new run"),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_a_run_is_not_resumed_with_another_scene(unstarted, tmp_path, plain_jax, other):
+    scene, (old, new, match) = write_scene(tmp_path, FREE), OTHERS[other]
+    shutil.copytree(unstarted, out := tmp_path / "run")
+    facts = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(facts).replace(str(unstarted.parent), str(tmp_path)))
+    assert train(scene, out, resume=True, steps=10).steps == 10
+    (wrong := tmp_path / "wrong.toml").write_text(scene.read_text().replace(old, new))
+    more = "; other too: garment.smoothing" if other == "two" else ""
+    with pytest.raises(InputError, match=rf"wrong.toml: {match}.*weights: start {out}{more}$"):
+        train(wrong, out, resume=True)
+
+
+def test_a_run_goes_on_with_its_own_scene_and_its_preset(tmp_path, plain_jax, recwarn):
+    scene, out = write_scene(tmp_path, FREE), tmp_path / "run"
+    with pytest.raises(InputError, match=r"scene: a scene expected"):
+        train(None, out)
+    train(load_scene(scene, "fast"), out, steps=10)
+    assert train(scene, out, steps=10, resume=True).steps == 10  # the preset is not given again
+    assert train(None, out, steps=20, resume=True).steps == 20
+    assert not [w for w in recwarn if issubclass(w.category, InputWarning)]
+
+
+def test_a_folder_of_motions_may_grow_before_a_run_is_resumed(tmp_path, plain_jax):
+    scene, out = write_scene(tmp_path, FREE.replace('files = ["swing.npz"]', 'files = ["takes"]')), tmp_path / "run"
+    (tmp_path / "takes").mkdir()
+    shutil.copy(tmp_path / "swing.npz", tmp_path / "takes" / "a.npz")
+    scene.write_text(scene.read_text().replace("validation", "#"))
+    train(scene, out, steps=10)
+    shutil.copy(tmp_path / "swing.npz", tmp_path / "takes" / "b.npz")
+    with pytest.warns(InputWarning, match=r"given otherwise now, and not taken: motion.files;"):
+        assert train(scene, out, steps=20, resume=True).steps == 20
+
+
+CHANGED = {  # in the scene of a run that is trained, and the field that is named
+    "decoder": ("network", {"decoder": [32]}, r"network.decoder: .*\(16,\) for decoder.layers_0.bias \(found \(32,\)\)"),
+    "deeper": ("network", {"static": [16, 16, 16]}, r"network.static: .*no array for static.layer_2.bias"),
+    "descriptor": ("network", {"descriptor": "axis_angle"}, r"network.descriptor, or body.joints: "),
+    "cell": ("network", {"cell": "linear"}, r"network.dynamic, joint or cell: "),
+    "method": ("network", {"method": "pbns"}, r"network.method, or garment.learn_weights: "),
+    "modes": ("network", {"modes": 4}, r"network.modes, or garment.file: .*shape \(30, 6\) \(found \(30, 4\)\)"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGED)
+def test_a_scene_that_was_changed_in_a_run_is_named(unstarted, tmp_path, plain_jax, change):
+    shutil.copytree(unstarted, out := tmp_path / "run")
+    (table, values, match), facts = CHANGED[change], read_run(out)
+    facts["scene"][table] |= values
+    write_run(out, facts)
+    with pytest.raises(InputError, match=rf"run.json: scene: {match}.*; the scene, or a file that it names, was changed"):
+        train(None, out, steps=20, resume=True) if change == "modes" else load_run(out)
+    assert Checkpoints(out).latest() == 10
 
 
 @pytest.fixture(scope="module")

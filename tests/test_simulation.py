@@ -11,7 +11,7 @@ from ncs_jax.runs import simulate as simulation
 from ncs_jax.scene.spec import load_scene
 from ncs_jax.simulation.solver.minimise import CONVERGED
 
-from .scenes import SCENE, write_scene
+from .scenes import SCENE, swing, write_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("plain_jax")]
 
@@ -99,6 +99,12 @@ def test_substeps_keep_the_frames(scene, unbroken, tmp_path):
     np.testing.assert_allclose(fine.vertices[0], unbroken.vertices[0], atol=5e-3)  # one static state: 0.1 g leave millimetres
     apart = np.linalg.norm(fine.vertices - unbroken.vertices, axis=-1).max()
     assert 1e-4 < apart < 0.1  # half the time step: less damping, the same motion
+
+
+def test_a_motion_beside_the_scenes_is_simulated_whole(tmp_path):
+    scene = write_scene(tmp_path, SMOOTH.replace("fps = 30", "fps = 30\nframes = [0, 4]").replace('"smooth"', '"plane"'))
+    np.savez(tmp_path / "clip.npz", **swing(frames=6))
+    assert [len(simulate(scene, name and str(tmp_path / name)).vertices) for name in (None, "clip.npz")] == [4, 6]
 
 
 def test_the_command_writes_an_animation_that_evaluates(scene, unbroken, tmp_path, capsys):

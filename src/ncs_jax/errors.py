@@ -8,7 +8,9 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-__all__ = ["InputError", "InputWarning", "for_python", "required", "shaped"]
+__all__ = ["InputError", "InputWarning", "check_alpha", "for_python", "required", "shaped"]
+
+LARGEST_ALPHA = 10.0  # far beyond 3, up to which garments were looked at; more is a slip, as 150 for 1.5
 
 # What an option of the commands is called in Python, where that is not its own name.
 ARGUMENTS = {"from": "start", "adapt": "seconds", "resume": "resume=True", "float16": "float16=True", "stay": "move=(0, 0, 0)"}
@@ -69,6 +71,15 @@ def required(value: T | None, field: str, mend: str | None = None) -> T:
     if value is None:
         raise InputError("missing, and needed here", field=field, mend=mend)
     return value
+
+
+def check_alpha(alpha: float, field: str = "alpha") -> None:
+    """Raise an InputError where motion control is not from 0 to `LARGEST_ALPHA`: below 0 cloth moves against its motion."""
+    if not 0 <= alpha <= LARGEST_ALPHA:  # nor of what is no number
+        raise InputError(
+            f"a number from 0 to {LARGEST_ALPHA:g} expected", field=field, value=alpha,
+            mend="0 is static, 1 as trained, 2 exaggerates; the further from 1, the more is extrapolated",
+        )  # fmt: skip
 
 
 def shaped(value, last: tuple[int, ...], field: str, what: str, mend: str | None = None) -> None:

@@ -30,12 +30,7 @@ def add_commands(commands) -> None:
         help="motion: FILE, FILE[10:300] or ncs:NAME (default: the scene's first one); given again, one more to --adapt to",
     )  # fmt: skip
     arguments.add_adapting(parser)
-    parser.add_argument(
-        "--alpha",
-        type=arguments.finite,
-        default=1.0,
-        help="how much the garment moves: 0 static, 1 as trained, more exaggerates",
-    )
+    arguments.add_alpha(parser)
     parser.add_argument(
         "--refine",
         type=arguments.whole,

@@ -12,12 +12,13 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, check_alpha
 
 __all__ = [
     "BLENDER",
     "FORMATS",
     "add_adapting",
+    "add_alpha",
     "add_body",
     "as_options",
     "body_of",
@@ -42,11 +43,13 @@ BLENDER = (
     "Forward Y, Up Z); Start Frame: the action's first; object at the origin, scale 1"
 )
 OPTIONS = {
+    "body.file": "--body",
     **{f"body.{name}": f"--{name}" for name in ("part", "betas")},
     **{f"body.{name}": f"--body-{name}" for name in ("scale", "up", "fps", "mesh")},
     **{f"garment.{name}": f"--{name}" for name in ("mesh", "scale", "up", "weld")},
 }  # what stands for the field of a scene
 MOVING = ("scale", "up", "fps", "mesh")  # what a scene says of a body that is a mesh for each frame
+NEGATIVE = re.compile(r"-([.,]?\d|inf\b|nan\b)")  # as numbers below 0 begin, and no option
 FORMATS = ".npz, .h5, .pc2, .mdd, .glb, .usd, .usdc, .usda, .usdz, or a folder of .obj"
 
 
@@ -54,6 +57,7 @@ def command(commands, name: str, run: Callable, text: str) -> argparse.ArgumentP
     """Add a command that calls `run` with its options, and return its parser."""
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(run=run)
+    parser._negative_number_matcher = NEGATIVE  # argparse takes -0,5 and -1e-3 for options
     return parser
 
 
@@ -90,6 +94,22 @@ def add_adapting(parser: argparse.ArgumentParser) -> None:
         help="first train on the motion itself for so many seconds, say 20, from the run's weights; the run stays as it is",
     )  # fmt: skip
     parser.add_argument("--adapted", metavar="RUN", help="folder of the adapted run (default: RUN_adapted_MOTION beside RUN)")
+
+
+def add_alpha(parser: argparse.ArgumentParser) -> None:
+    """Add the option that sets how much a garment moves."""
+    parser.add_argument(
+        "--alpha", type=_alpha, default=1.0, help="how much the garment moves: 0 static, 1 as trained, more exaggerates; to 10"
+    )
+
+
+def _alpha(text: str) -> float:
+    value = _number(text, "a finite number", math.isfinite)
+    try:
+        check_alpha(value)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(f"{error.expected}, found {text}; {error.mend}") from None
+    return value
 
 
 def check_motions(scene) -> None:

@@ -60,7 +60,7 @@ def check(options) -> int:
     risks = find_risks(setting, _say)
     groups = _alike(setting.motions)
     drawn = _draw(options.out, setting, _worst_first(groups, setting, risks))
-    print(f"{options.scene}: " + (f"good, but at risk: {len(risks)}" if risks else "good"))
+    print(f"at risk: {len(risks)} in {options.scene}" if risks else f"{options.scene}: good")
     _tell_risks(risks, Path(options.out).with_suffix(".risks.txt"))
     for note in scene.motion.found:
         tell("found", note)

@@ -26,7 +26,7 @@ def add_commands(commands) -> None:
     parser.add_argument("target", metavar="RUN|FILE", help="run folder, or an animation file together with --scene")
     parser.add_argument("--motion", metavar="FILE", help="motion: FILE, FILE[10:300] or ncs:NAME (default: all of the scene's)")
     parser.add_argument("--scene", metavar="SCENE", help="the scene that an animation file belongs to")
-    parser.add_argument("--alpha", type=arguments.finite, default=1.0, help="motion control")
+    arguments.add_alpha(parser)
     parser.add_argument(
         "--reference", metavar="FILE", help="an animation of the same motion, say by ncs simulate, to compare the movement with"
     )

@@ -38,7 +38,7 @@ KEPT = 2 << 30  # bytes of compiled programs, at most
 
 # What an interrupted command has kept.
 GOES_ON = {
-    train.train: "; `ncs train {scene} --out {out} --resume` goes on from the last checkpoint",
+    train.train: "; `ncs train --out {out} --resume` goes on from the last checkpoint",
     train.demo: "; `ncs demo --out {out}` goes on from the last checkpoint",
     simulate.simulate: "; the same command goes on with the frames that are done",
 }

@@ -40,7 +40,9 @@ def add_commands(commands) -> None:
     parser.add_argument("--scene", default="ncs:demo", help="another scene file")
 
     parser = arguments.command(commands, "train", train, "train the garment of a scene file from the physics energy alone")
-    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML), or ncs:NAME for a packaged one")
+    parser.add_argument(
+        "scene", metavar="SCENE", nargs="?", help="scene file (TOML), or ncs:NAME for a packaged one; none to --resume"
+    )
     parser.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints and logs")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=arguments.whole, help="optimiser steps in all (default: the scene's)")
@@ -69,8 +71,12 @@ def train(options) -> int:
         raise InputError("a run keeps its network", field="--preset", value=options.preset, mend="leave it out, or begin anew")
     if options.video:
         check_video(options.out)
-    scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
-    arguments.check_motions(scene)
+    scene = None
+    if options.scene is not None:
+        scene = load_scene(options.scene, options.preset)  # before JAX is imported, which takes a second
+        arguments.check_motions(scene)
+    elif not options.resume:
+        raise InputError("a scene file is needed", field="SCENE", mend="give one, ncs:tshirt for the packaged one, or --resume")
 
     import jax
 
@@ -90,9 +96,7 @@ def train(options) -> int:
     if jax.process_index() == 0:
         if options.preview or options.video:
             draw(run, options.out, video=options.video)
-        given = shlex.join([options.scene, "--out", options.out])
-        own = f", with the scene that {options.out}/run.json keeps" if options.resume else ""
-        _warn_of_few_steps(run, options.steps, f"ncs train {given} --resume --minutes M goes on{own}")
+        _warn_of_few_steps(run, options.steps, f"ncs train --out {shlex.quote(options.out)} --resume --minutes M goes on")
     return 0
 
 

@@ -31,6 +31,7 @@ UNITS = {
 }  # metres a unit of a file, and its name
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
+LIKELY = 3  # units that are named
 NAMED = 2  # pairs of triangles that pass through each other
 SMALL = 0.12  # m: no head, hand or foot passes through a shorter opening,
 FEW, SHORT = 6, 0.25  # nor is one of so few edges meant that is so much shorter than the longest
@@ -99,7 +100,7 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
     The message names the unit and the axis that would bring the garment onto the body, found by the boxes around both. They
     are not applied: a box cannot tell a garment in inches from a large one, nor a dress from a doll's at the thigh, and the
     whole training depends on them. A scene file that states them means the same with every body. What the scene states is not
-    guessed at.
+    guessed at, but for a unit in which it has no size of clothes.
 
     Args:
         file: the garment's, for errors. garment: as read. body: vertices (V, 3), m. axis_given, scale_given: the scene states
@@ -113,7 +114,8 @@ def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_
         raise InputError(
             f"a garment about the size of the body ({tall:.2f} m) expected", file=file, field="vertices",
             value=f"{size:.3g} m",
-            mend=_mend(garment, body, told) or ("it may have another unit: mend" if scale_given else "state its unit by")
+            mend=_mend(garment, body, (False, axis_given))
+            or ("it may have another unit: mend" if scale_given else "state its unit by")
             + " garment.scale in the scene file, or bring it there by ncs fit",
         )  # fmt: skip
     if gap > FAR * tall:
@@ -140,20 +142,27 @@ def _mend(garment: GarmentRecord, body: np.ndarray, told: tuple[bool, bool]) -> 
     """
     raw = garment.vertices / garment.scale @ TURNS[garment.up].T
     for up in (garment.up,) if told[1] else dict.fromkeys((garment.up, "y", "z", "x")):
-        for scale in (garment.scale,) if told[0] else dict.fromkeys((garment.scale, *UNITS)):
-            x = upright(raw, scale, up)
-            if distance_outside(x, body) <= FAR and np.ptp(x, axis=0).max() >= FAR * np.ptp(body, axis=0).max():
-                words, fields = [], []
-                if scale != garment.scale:
-                    words, fields = [UNITS[scale]], [f"scale = {scale:g}"]
-                if up != garment.up:
-                    words, fields = [*words, f"{up.upper()} up"], [*fields, f'up = "{up}"']
-                if told[0]:
-                    other = f"if its axes are others, write {fields[0]} below [garment] in the scene file"
-                    return f"bring it there by ncs fit, or, {other}"
-                guess = f"its box would suit {', '.join(words)}: if it is so, write {' and '.join(fields)} below [garment]"
-                return f"let ncs fit find its unit, axes and place; {guess} in the scene file"
+        units = (garment.scale,) if told[0] else dict.fromkeys((garment.scale, *UNITS))
+        scales = [scale for scale in units if _is_within(upright(raw, scale, up), body)]
+        if not scales:
+            continue
+        axis = [] if up == garment.up else [f'up = "{up}"']
+        if told[0]:
+            return f"bring it there by ncs fit, or, if its axes are others, write {axis[0]} below [garment] in the scene file"
+        # As clothes surround the body, the largest is the likeliest.
+        scales = [] if garment.scale in scales else sorted(scales, reverse=True)[:LIKELY]
+        words = [" or ".join(UNITS[scale] for scale in scales)] if scales else []
+        fields = [f"scale = {' or '.join(f'{scale:g}' for scale in scales)}"] if scales else []
+        suits = ", ".join([*words, *(f"{up.upper()} up" for _ in axis)])
+        which = "whichever it is" if len(scales) > 1 else "if it is so"
+        guess = f"its box would suit {suits}: {which}, write {' and '.join([*fields, *axis])} below [garment]"
+        return f"let ncs fit find its unit, axes and place; {guess} in the scene file"
     return ""
+
+
+def _is_within(x: np.ndarray, body: np.ndarray) -> bool:
+    """Tell whether points (N, 3) lie in the box around a body (V, 3), or nearly, and are not tiny beside it."""
+    return distance_outside(x, body) <= FAR and np.ptp(x, axis=0).max() >= FAR * np.ptp(body, axis=0).max()
 
 
 def distance_outside(x: np.ndarray, body: np.ndarray) -> float:

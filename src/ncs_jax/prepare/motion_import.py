@@ -34,6 +34,7 @@ from ncs_jax.prepare.reference_pose import (
 from ncs_jax.prepare.retarget import body_names, paired, retarget, turn_note, up_rotation, with_skeleton
 from ncs_jax.prepare.skeleton import rest_of, standing_axis
 from ncs_jax.scene.motion_lists import LISTING
+from ncs_jax.scene.motion_names import LISTS, split_frames
 from ncs_jax.scene.spec import MotionSpec, Scene
 
 Reader = Callable[[int, int | None], MotionRecord]
@@ -305,6 +306,9 @@ def _by_kind(faults: Mapping[str, InputError]) -> str:
 def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.MotionRecord:
     """Read a motion of the scene for its body, see `retarget_to_body`, and resample it to the scene's frame rate."""
     path, spec = scene.motion_file(name)
+    for key in () if scene.motion.lone else LISTS:
+        if name in getattr(scene.motion, key):
+            scene.there(split_frames(name)[0], f"motion.{key}")
     chosen = (spec.frames[0], spec.frames[1] if len(spec.frames) > 1 else None) if spec.frames else None
     gravity = np.array(scene.physics.gravity)
     if path.suffix.lower() in ("", *LISTING) and not path.exists():  # else its suffix would be at fault
@@ -316,6 +320,9 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
         )
         count, absent = len(record.poses), _absent(record, spec.joints)
         record = retarget_to_body(record, body, spec, "z" if np.abs(gravity).argmax() == 2 else "y", read)
+        if chosen and spec.frames is scene.motion.frames:
+            said = "from {} on" if chosen[1] is None else "from {} to before {}"
+            record = replace(record, notes=(*record.notes, f"frames {said.format(*chosen)}, as motion.frames says"))
     except InputError as error:
         if error.file is not None:
             raise

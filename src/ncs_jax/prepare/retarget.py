@@ -35,6 +35,9 @@ PERSON = {
     "hand": (0.85, 1.39, 0),
 }  # fmt: skip
 
+ENDS = ("thigh", "shin", "foot", "arm", "forearm", "hand")
+PAIRED = ("hips", "head", *(f"{side} {part}" for part in ENDS for side in ("left", "right")))  # that an error names
+
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
@@ -170,9 +173,12 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
     if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
+        ours = [names[target.roles[word]] for word in PAIRED if word in target.roles]
         raise InputError(
-            "joint names that say what they are expected", field="joint_names", value=list(motion.joint_names),
-            mend=f"pair them with the body's by motion.joints in the scene file; the body has {', '.join(names)}",
+            "joints that are a body's by name or shape expected: hips, head and limbs are not found", field="motion.joints",
+            value=f"{len(motion.joint_names)} joints, {', '.join(motion.joint_names[:4])}, ...",
+            mend=f"another creature cannot drive this body; else pair its joints with the body's {', '.join(ours)}: "
+            f'joints = {{ "{motion.joint_names[0]}" = "{ours[0]}", ... }} below [motion]',
         )  # fmt: skip
     return source, target, pairs
 

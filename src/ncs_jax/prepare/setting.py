@@ -145,6 +145,9 @@ def _betas(scene: Scene) -> np.ndarray:
 def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> SceneFiles:
     """Read the files of a scene but for its motions, and check that they fit together."""
     body, person, spec = None, scene.body, scene.garment
+    if person.file not in ("", "none"):
+        scene.there(person.file, "body.file")
+    scene.there(spec.file, "garment.file")
     if scene.moves_by_itself:
         body = moving_body(scene)
     elif person.file not in ("", "none"):

@@ -217,7 +217,7 @@ def _scene_on(run: Run, motions: str | Sequence[str]) -> tuple[Scene, dict[str, 
         path = scene.path(file) if name in scene.motions else Path(file).expanduser()
         whole = (file if file.startswith("ncs:") else str(path.resolve())) + name.removeprefix(file)
         records[whole] = run.motion(name)
-        own |= {whole: scene.motion.own[name]} if name in scene.motion.own else {}
+        own |= {whole: settings} if (settings := scene.own_settings(name if name in scene.motions else whole)) else {}
     motion = replace(scene.motion, files=tuple(records), validation=(), mirror=False, own=own)
     training = replace(scene.training, motion_augmentation=min(AUGMENTED, scene.training.motion_augmentation))
     return replace(scene, motion=motion, training=training), records

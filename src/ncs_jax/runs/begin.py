@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +23,13 @@ from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
 from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
-from ncs_jax.scene.spec import NetworkSpec, Scene, scene_from
+from ncs_jax.scene.spec import PRESETS, NetworkSpec, Scene, scene_from
 from ncs_jax.training.step import initial_state
 
 __all__ = ["assemble_run", "facts_of_run", "resumed_scene", "unread_joints"]
 
 FREE = ("damping",)  # fields of [network] that no weight depends on
+MODELLED = ("body", "garment", "motion", "physics", "network")  # tables of a scene that a run which is resumed keeps
 
 
 def assemble_run(
@@ -51,7 +53,9 @@ def assemble_run(
         return _assemble_started(start, scene, network, functools.partial(make_ready, ahead=None))
     assembly = make_ready(scene)
     if facts is not None and out is not None and (out / "prepared.npz").exists():  # of what it has learned: not found anew
-        assembly = _with_fields_of(read_prepared(out), assembly)
+        kept = read_prepared(out)
+        _check_prepared(out, kept, assembly.prepared)
+        assembly = _with_fields_of(kept, assembly)
     return assembly, None
 
 
@@ -85,11 +89,12 @@ def _check_swing(kept: Prepared, run: str) -> None:
         raise InputError("a swing of this version expected", file=run, field="prepared.npz: slope", mend=mend)
 
 
-def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps: int | None) -> Scene:
-    """Return the scene of a run that is resumed; warn where the one given is another.
+def resumed_scene(facts: dict, out: Path, scene: Scene | None, seed: int | None, steps: int | None) -> Scene:
+    """Return the scene of a run that is resumed; warn where the one given, if any, is to be trained otherwise.
 
     Raises:
-        InputError: the seed is another one, the run has more steps than `steps`, or it began from a run and has no checkpoint.
+        InputError: the scene given has another model, the seed is another one, the run has more steps than `steps`, or it began
+            from a run and has no checkpoint.
     """
     if seed is not None and seed != facts["seed"]:
         raise InputError("a run keeps its seed", file=out, field="seed", value=seed, mend="leave it out, or begin a new run")
@@ -104,22 +109,53 @@ def resumed_scene(facts: dict, out: Path, scene: Scene, seed: int | None, steps:
     kept = scene_from(facts["scene"], source=str(out / "run.json"))
     if (out / "prepared.npz").exists():  # else it was killed before that was written
         _check_swing(read_prepared(out), str(out))
-    chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
-    chosen |= {"network.cell"} if scene.network.cell == "auto" else set()
-    other = [what for what in _differences(kept.to_dict(), scene.to_dict()) if what not in chosen]
-    if other:
-        what = f"{out} keeps the scene that it began with; given otherwise now, and not taken: {', '.join(other)}"
-        warnings.warn(f"{what}; a new run can begin from its weights: --from {out}", category=InputWarning, stacklevel=3)
+    if scene is not None:
+        _check_same_scene(facts, out, kept, scene)
     return kept
 
 
-def _differences(kept: dict, given: dict, where: str = "") -> Iterator[str]:
-    """Yield the name of every field that two scenes have different values of."""
+def _check_prepared(out: Path, kept: Prepared, found: Prepared) -> None:
+    """Raise an InputError where what a run keeps of its garment is of another size than what its scene gives now."""
+    for name, field in (("basis", "network.modes, or garment.file"), ("vibrations", "network.cell, or network.vibrations")):
+        shapes = [getattr(prepared, name).shape for prepared in (kept, found)]
+        apart = shapes[0] != shapes[1] if name == "basis" else (0 in shapes[0]) != (0 in shapes[1])
+        if apart:
+            raise InputError(
+                f"the garment that was trained expected, with {name} of shape {shapes[0]}", file=out / "run.json",
+                field=f"scene: {field}", value=shapes[1],
+                mend="the scene, or a file that it names, was changed since: change it back, or train anew into another folder",
+            )  # fmt: skip
+
+
+def _check_same_scene(facts: dict, out: Path, kept: Scene, scene: Scene) -> None:
+    """Refuse a scene of another model than a run's; warn where only its training or simulation differs: neither is taken."""
+    chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
+    chosen |= {"network.cell"} if scene.network.cell == "auto" else set()
+    tables = kept.to_dict(), scene.to_dict()
+    by_preset = [{table: tables[1][table] | values for table, values in preset.items()} for preset in ({}, *PRESETS.values())]
+    each = [[d for d in _differences(tables[0], tables[1] | preset) if d[0] not in chosen] for preset in by_preset]
+    other = min(each, key=len)  # of a run that began with --preset, which is not given again
+    lists = {"motion.files", "motion.validation"} if scene.motion.found or scene.motion.broken == "skip" else set()
+    if refused := [each for each in other if each[0].split(".")[0] in MODELLED and each[0] not in lists]:
+        (name, before, now), *more = refused
+        raise InputError(
+            f"the scene of {out} expected, where it is {json.dumps(before)}", file=scene.source, field=name, value=now,
+            mend=f"leave the scene out to go on with the run's, or begin a new run with its weights: --from {out}"
+            + (f"; other too: {', '.join(each[0] for each in more)}" if more else ""),
+        )  # fmt: skip
+    if other:
+        what = f"{out} keeps the scene that it began with; given otherwise now, and not taken: {', '.join(d[0] for d in other)}"
+        warnings.warn(f"{what}; a new run can begin from its weights: --from {out}", category=InputWarning, stacklevel=4)
+
+
+def _differences(kept: dict, given: dict, where: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name and both values of every field that two scenes have different values of."""
     for key, value in kept.items():
-        if isinstance(value, dict):
-            yield from _differences(value, given[key], f"{where}{key}.")
-        elif json.dumps(value) != json.dumps(given[key]):  # a list and a tuple are one there
-            yield f"{where}{key}"
+        now = given[key]
+        if isinstance(value, dict) and value.keys() == now.keys():
+            yield from _differences(value, now, f"{where}{key}.")
+        elif json.dumps(value) != json.dumps(now):  # a list and a tuple are one there
+            yield f"{where}{key}", value, now
 
 
 # --- the weights of another run ---------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ import gc
 import json
 import logging
 import os
+import re
 import shutil
 import sys
 import time
@@ -45,6 +46,14 @@ __all__ = [
 
 KEPT = 2  # checkpoints
 NAME = "default"  # what Orbax calls the one thing in a checkpoint: so its version 0 did, and each reads what the other wrote
+CHANGED = {  # arrays of a network, and what of a scene sets their sizes, what is sure first
+    r"static\..*bias": "network.static",
+    r"decoder\.layers.*bias": "network.decoder",
+    r"decoder\.offsets\.bias": "garment.file",
+    r"decoder\.coefficients\.bias": "network.modes",
+    r"static\.": "network.descriptor, or body.joints",
+    r"dynamic\.": "network.dynamic, joint or cell",
+}
 TEMPORARY = ".orbax-checkpoint-tmp"
 
 
@@ -206,8 +215,30 @@ class Checkpoints:
             except Exception as error:  # Orbax and its store have no common error class
                 reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
             _let_go()
+            self._check_network(folder, like)
         mend = "delete this folder to go back to the checkpoint before it"
         raise InputError(f"the checkpoint cannot be read: {reason}", file=folder, mend=mend)
+
+    def _check_network(self, folder: Path, like: Any) -> None:
+        """Raise an InputError where a checkpoint cannot be read because its network is another than the scene's."""
+        try:
+            kept = _shapes(_orbax().metadata(folder).metadata["params"])
+        except Exception:  # it is damaged
+            return
+        expected = _shapes(like.params)
+        apart = [name for name in sorted({*kept, *expected}) if kept.get(name) != expected.get(name)]
+        if not apart:
+            return
+        parts = [{name.split(".")[0] for name in shapes} for shapes in (kept, expected)]
+        field, name = "network.method, or garment.learn_weights", apart[0]
+        if parts[0] == parts[1]:
+            found = ((fields, name) for pattern, fields in CHANGED.items() for name in apart if re.match(pattern, name))
+            field, name = next(found, ("network", apart[0]))
+        raise InputError(
+            f"the network that was trained expected, with {kept.get(name, 'no array')} for {name}",
+            file=folder.parents[1] / "run.json", field=f"scene: {field}", value=expected.get(name, "no array"),
+            mend="the scene, or a file that it names, was changed since: change it back, or train anew into another folder",
+        )  # fmt: skip
 
     def _steps(self) -> list[int]:
         return sorted(int(p.name) for p in self._folder.iterdir() if p.name.isdigit())
@@ -219,6 +250,11 @@ class Checkpoints:
             (self._folder / str(step)).rename(self._folder / f"{step}{TEMPORARY}")
         for left in self._folder.glob(f"*{TEMPORARY}"):
             shutil.rmtree(left)
+
+
+def _shapes(params: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each array of a network by its name, as static.layer_0.bias."""
+    return {".".join(str(key.key) for key in at): tuple(a.shape) for at, a in jax.tree.leaves_with_path(params)}
 
 
 def _orbax():
@@ -243,14 +279,15 @@ def _alone(ocp):
 def _quiet():
     """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    log = logging.getLogger("asyncio")
-    level = log.level
-    log.setLevel(logging.CRITICAL + 1)
+    logs = {log: log.level for log in map(logging.getLogger, ("asyncio", "absl"))}
+    for log in logs:
+        log.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        log.setLevel(level)
+        for log, level in logs.items():
+            log.setLevel(level)
 
 
 def _let_go(seconds: float = 1.0) -> None:

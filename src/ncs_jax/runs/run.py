@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.energies.terms import OwnTerm
-from ncs_jax.errors import InputError
+from ncs_jax.errors import InputError, check_alpha
 from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion
@@ -84,10 +84,9 @@ class Run:
         frame, and of how many.
 
         Raises:
-            InputError: alpha is not finite; or a vertex is not: where, and what was so first.
+            InputError: alpha is not from 0 to 10; or a vertex is not finite: where, and what was so first.
         """
-        if not np.isfinite(alpha):
-            raise InputError("a finite number expected", field="alpha", value=alpha)
+        check_alpha(alpha)
         track = self.track(motion)
         a = self.assembly
         x = animated(a.model, a.network, self.params, track, alpha)

@@ -26,6 +26,7 @@ from ncs_jax.prepare.build import Assembly, features_from_records, tell_a_person
 from ncs_jax.prepare.motion_import import load_motion
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import Model
+from ncs_jax.scene.motion_names import split_frames
 from ncs_jax.scene.spec import Scene, load_scene
 from ncs_jax.simulation.implicit_euler import SimulationState, Simulator, simulator_from, stepper
 from ncs_jax.simulation.solver.minimise import Settings, Solution
@@ -147,13 +148,16 @@ def simulate(
     scene = load_scene(scene) if isinstance(scene, str | Path) else scene
     named = (*scene.motion.files, *scene.motion.validation)
     name = motion or (named[0] if named else None)
+    if motion is None and name is not None:
+        scene.there(split_frames(name)[0], "motion." + ("files" if scene.motion.files else "validation"))
     if name is not None and not name.startswith("ncs:") and name not in named:
         name = str(Path(name).absolute())
     fine = scene.motion.fps * scene.simulation.substeps
     # What can be touched is found out from this motion.
+    alone = {"files": (), "own": {}} if name is None else {"files": (name,), "own": {name: scene.own_settings(name)}}
     lone = replace(
         scene.without_network(),
-        motion=replace(scene.motion, files=() if name is None else (name,), validation=(), fps=fine, mirror=False, lone=True),
+        motion=replace(scene.motion, **alone, validation=(), fps=fine, mirror=False, lone=True),
     )
     precision = scene.simulation.precision
     if precision != "double":

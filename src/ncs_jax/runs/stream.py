@@ -8,6 +8,7 @@ from typing import BinaryIO
 import jax
 import numpy as np
 
+from ncs_jax.errors import check_alpha
 from ncs_jax.geometry.skinning import to_rest_axes
 from ncs_jax.network.rollout import stepper
 from ncs_jax.runs.run import Run
@@ -44,6 +45,7 @@ def serve_frames(run: Run, source: BinaryIO, sink: BinaryIO) -> int:
         return rollout.step(state, rotations, translation, alpha)
 
     def answer(state, frame: np.ndarray):
+        check_alpha(float(frame[1]))
         rotations = frame[HEAD:].reshape(len(names), 3, 3)[chosen]
         state, vertices = step(state, rotations.astype(dtype), frame[2:HEAD].astype(dtype), float(frame[1]))
         return state, np.asarray(vertices, "<f4")

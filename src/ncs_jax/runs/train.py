@@ -44,7 +44,7 @@ ALONG = 0.25  # of its swing that the cloth should go along with by the end
 
 
 def train(
-    scene: Scene | str | Path,
+    scene: Scene | str | Path | None,
     out: str | Path | None = None,
     *,
     steps: int | None = None,
@@ -60,7 +60,8 @@ def train(
     """Train a garment from the physics energy alone, on every device that JAX sees.
 
     Args:
-        scene: a scene, or the path of a scene file. out: run folder for checkpoints and logs; None keeps nothing.
+        scene: a scene, or the path of a scene file; None, with `resume`: the run's own.
+        out: run folder for checkpoints and logs; None keeps nothing.
         steps: optimiser steps in all, else the scene's. minutes: instead, as many as fit, from the first step on. seed: alike.
         resume: continue the run in `out`: to `steps`, for `minutes` more, or as was planned; its scene and seed stand.
         start: a run, or its folder, of the same garment and network, whose weights to begin from; the optimiser begins anew.
@@ -71,10 +72,12 @@ def train(
     After `jax.distributed.initialize`, every process makes the same call, and the first one writes and reports.
 
     Raises:
-        InputError: scene or folder are unusable, a run has more steps than it is to have, or `start` or the hosts do not fit.
+        InputError: scene or folder are unusable, a run has more steps than it is to have or another scene, or `start` or the
+            hosts do not fit.
     """
     scene, began = load_scene(scene) if isinstance(scene, str | Path) else scene, time.monotonic()
-    refuse_training(scene)
+    if scene is not None:
+        refuse_training(scene)
     out = None if out is None else Path(out)
     _check_options(steps, minutes, resume, start)
     facts = facts_of_run(out, resume, terms, network)
@@ -85,6 +88,8 @@ def train(
             return load_run(out, terms=terms, network=network)
         if say is not None:
             say(f"going on from step {done or 0}")
+    if scene is None:
+        raise InputError("a scene expected where no run is resumed", field="scene", mend="give a file, or ncs:NAME")
     programs, first = Programs(), CHUNK if minutes is not None else min(CHUNK, steps or scene.training.steps)
     begin = functools.partial(begin_programs, programs, count=first)  # while the rest is found out
     make_ready = functools.partial(assemble, terms=terms, network=network, report=say, ahead=begin)

@@ -15,6 +15,7 @@ from ncs_jax.errors import InputError
 
 __all__ = ["checked_value", "parse_table", "read_toml"]
 
+THOUSANDTHS = {"m": "mm", "kg/m^2": "g/m^2"}  # in which lengths and densities are often given
 SINGLE = "or put the path in single quotes"
 BACKSLASHES = r"\\+"
 BACKSLASH = re.compile(r'"[^"]*\\[^"]*"')
@@ -72,7 +73,9 @@ def _texts(value, where: str) -> Iterator[tuple[str, str]]:
 def parse_table(cls, tables, source: str, where: str):
     """Return a dataclass from a table: every key must be a field, every value of its type and in its range."""
     if not isinstance(tables, dict):
-        raise InputError("a table expected", file=source, field=where, value=tables, mend=f"write [{where}] and its fields")
+        named = isinstance(tables, str) and any(f.name == "file" for f in dataclasses.fields(cls))
+        mend = f'write file = "{tables}" below [{where}]' if named else f"write [{where}] and its fields"
+        raise InputError("a table expected", file=source, field=where, value=tables, mend=mend)
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
     for key in tables:
@@ -126,5 +129,11 @@ def checked_value(kind, value, meta, source, where):
         low, high = meta["low"], meta["high"]
         if not (low < value <= high if meta["above"] else low <= value <= high):
             bounds = f"a number {'above' if meta['above'] else 'from'} {low:g} {'up ' if meta['above'] else ''}to {high:g}"
-            raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value)
+            mend = None
+            for unit, smaller in THOUSANDTHS.items():
+                if value > high >= value / 1000 >= low and re.search(rf", {re.escape(unit)}(?=$|[;:])", meta["help"]):
+                    mend = (
+                        f"{value:g} {smaller} are {value / 1000:g} {unit}: write {where.rsplit('.', 1)[-1]} = {value / 1000:g}"
+                    )
+            raise InputError(f"{bounds} expected ({meta['help']})", file=source, field=where, value=value, mend=mend)
     return kind(value)

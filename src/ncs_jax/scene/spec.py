@@ -252,11 +252,40 @@ class Scene:
         path = Path(name).expanduser()
         return path if path.is_absolute() or not self.source else Path(self.source).parent / path
 
+    def there(self, name: str, field: str) -> Path:
+        """Return the path of a file that a field of this scene names.
+
+        Raises:
+            InputError: there is none.
+        """
+        path = self.path(name)
+        if name.startswith("ncs:") or path.exists() or ("#" in path.name and Path(str(path).rpartition("#")[0]).exists()):
+            return path  # the file, or an animation in it
+        seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent}"
+        raise InputError("no such file or folder", file=self.source, field=field, value=name, mend=f"check the path{seen}")
+
     def motion_file(self, name: str) -> tuple[Path, MotionSpec]:
-        """Return the path of a motion, and its settings: the scene's, but for frames in its name and what its table says."""
+        """Return the path of a motion, and its settings: the scene's, but for frames in its name and `own_settings`."""
         file, frames = split_frames(name)
-        own = self.motion.own.get(name, {}) | ({} if frames is None else {"frames": frames})
+        own = self.own_settings(name) | ({} if frames is None else {"frames": frames})
         return self.path(file), dataclasses.replace(self.motion, **own)
+
+    def own_settings(self, name: str) -> dict[str, Any]:
+        """Return the settings that a motion has in place of the scene's: what its table says.
+
+        A motion that the scene does not name, or not with these frames, is taken whole: `frames` are of the scene's own files.
+        A packaged one knows its unit, axis and zero pose.
+        """
+        if name in self.motions:
+            return self.motion.own.get(name, {})
+        file, frames = split_frames(name)
+        path = self.path(file).resolve()
+        alike = [own for own in self.motions if self.path(split_frames(own)[0]).resolve() == path]  # by another path, too
+        own = self.motion.own.get(alike[0], {}) if alike else {}
+        if frames is None and alike and split_frames(alike[0])[1] is None:
+            return own
+        known = ("frames", "scale", "up", "rest") if not alike and name.startswith("ncs:") else ("frames",)
+        return own | {key: getattr(MotionSpec(), key) for key in known}
 
     @property
     def moves_by_itself(self) -> bool:

@@ -68,12 +68,13 @@ def read_body(
     if suffix in (".pkl", ".pickle"):
         raise pickle_refused(path)
     if suffix != ".npz":
-        skinless = "convert it"
+        mend = "convert it, as in Blender or Mixamo, and export .glb or .fbx"
         if suffix in MESHES:
-            skinless = "a mesh alone has no skin (ncs simulate takes one for each frame): give it a skeleton and weights"
+            mend = "a mesh alone has none (a folder of one for each frame moves by itself). If these are clothes, they are the "
+            mend += "garment, and the body is ncs:body or a character; else rig it, as in Mixamo, and export .glb or .fbx"
         raise InputError(
-            f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix",
-            mend=f"{skinless}, as in Blender or Mixamo, and export .glb or .fbx",
+            f"a character with skeleton and skinning weights expected, {', '.join(FORMATS)}", file=path, field="body.file",
+            value=suffix or "no suffix", mend=mend,
         )  # fmt: skip
     table = read_npz(path, {*FIELDS, *smpl_fields(len(betas) > 0, correctives)}.__contains__)
     if "v_template" in table:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.character.hierarchy import by_depth, lowest_common, nearest_parents, path_to_root
@@ -269,7 +269,9 @@ def _upright(matrices: np.ndarray, share: np.ndarray, armature: np.ndarray) -> n
 
 def quarter_turns() -> np.ndarray:
     """Return the 24 rotations (24, 3, 3) that take axes of coordinates to axes of coordinates, the identity first."""
-    return np.round(Rotation.create_group("O").as_matrix())
+    axes, signs = permutations(range(3)), product((1.0, -1.0), repeat=3)
+    turned = np.stack([np.eye(3)[list(order)] * sign for order, sign in product(axes, signs)])
+    return turned[np.linalg.det(turned) > 0]
 
 
 def _placed(piece: Piece, to_world: np.ndarray, place: dict[int, int]) -> tuple:

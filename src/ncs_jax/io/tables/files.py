@@ -17,6 +17,12 @@ __all__ = ["LARGEST", "check_place", "decoded", "readable", "reading", "replacin
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
 PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
 
+# How files begin that are no mesh, motion or table, whatever they are called.
+OTHERS = {
+    b"\x89PNG": "a PNG picture", b"\xff\xd8\xff": "a JPEG picture", b"GIF8": "a GIF picture", b"8BPS": "a Photoshop picture",
+    b"%PDF": "a PDF", b"<!DOCTYPE": "a web page", b"<!doctype": "a web page", b"<html": "a web page", b"BLENDER": "a .blend",
+}  # fmt: skip
+
 # Characters of words for parts of a body, by the encodings in which editors on Windows save them.
 PARTS = {
     "cp932": "左右上下半身首腰肩腕肘手足膝頭胸指骨盤脚ひじざつまセンターグルブ",
@@ -26,19 +32,22 @@ PARTS = {
 
 
 def readable(path: str | Path) -> Path:
-    """Return the path of a file. Raise an InputError unless it is a regular file, not empty, that may be read."""
+    """Return the path of a file. Raise an InputError unless it is a file that may be read, not empty nor of `OTHERS`."""
     file = Path(path).expanduser()
     if file.is_dir():
         raise InputError("a file expected", file=file, value="a folder", mend="name a file in it")
     if not file.is_file():
         raise InputError("no such file", file=file, mend="check the path")
     try:
-        with file.open("rb"):
-            size = file.stat().st_size
+        with file.open("rb") as opened:
+            size, begins = file.stat().st_size, opened.read(16)
     except OSError as error:
         raise InputError(f"cannot be opened: {error}", file=file, mend="check the path and its permissions") from None
     if size == 0:
         raise InputError("an empty file", file=file, value="0 bytes", mend="write it again")
+    if found := next((what for start, what in OTHERS.items() if begins.startswith(start)), None):
+        mend = "export it from where it was made, or get it again: another name makes no other file"
+        raise InputError(f"a {file.suffix or 'file to read'} expected, by what is in it", file=file, value=found, mend=mend)
     return file
 
 
