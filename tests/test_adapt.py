@@ -67,6 +67,11 @@ def test_adapted_is_a_run_that_goes_on_and_does_nothing_twice(trained, tmp_path,
     assert more.before == first.before
     assert "before:  total" in str(more) and "20 steps" in str(more) and str(out) in str(more)
 
+    for more_steps in (None, 40):
+        with pytest.raises(
+            InputError, match=r"not adapted expected .*one adapted for 0.002 s.*--adapt SECONDS --adapted .*start "
+        ):
+            train(write_scene(tmp_path), out, steps=more_steps, resume=True)
     with pytest.raises(InputError, match=r"adapted to ncs:.*swing.npz expected .*clip.npz.*another folder".replace("ncs:", "")):
         adapt(run, str(trained / "swing.npz"), MOMENT, out)
     with pytest.raises(InputError, match="found 'another run'"):

@@ -9,6 +9,7 @@ import trimesh
 
 from ncs_jax import InputError, assemble, io, load_scene
 from ncs_jax.cli import main
+from ncs_jax.cli.fit import HOLES
 from ncs_jax.geometry.mesh import topology
 from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS
@@ -293,6 +294,24 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     assert "ends in .npz expected" in capsys.readouterr().err
     assert main(["fit", str(tmp_path / "gone.obj"), "--body", str(tmp_path / "body.npz"), "--out", "x.npz"]) == 2
     assert "gone.obj" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.001])
+def test_vertices_are_welded_in_metres_whatever_the_unit_that_is_found(tmp_path, capsys, scale):
+    """Single precision splits them: each triangle has its own, off by what a float of a thousand millimetres is."""
+    np.savez(tmp_path / "body.npz", **post())
+    given = sleeve(0.085)
+    corners = given.vertices[given.faces].reshape(-1, 3)
+    corners = corners + np.random.default_rng(0).uniform(-1e-7, 1e-7, corners.shape)
+    np.savez(tmp_path / "g.npz", vertices=corners / scale, faces=np.arange(len(corners)).reshape(-1, 3))
+    command = ["fit", str(tmp_path / "g.npz"), "--body", str(tmp_path / "body.npz"), "--stay", "--out", str(tmp_path / "x.npz")]
+    main(command)
+    count = f"{len(corners) - len(given.vertices)} vertices lie where another one is"
+    told = capsys.readouterr().out
+    assert count in told and "--weld 1e-05 joins them" in told and told.count("hole ") <= HOLES + 1
+    assert main([*command, "--weld", "1e-5"]) == 0
+    told = capsys.readouterr().out
+    assert f": {len(given.vertices)} vertices" in told and "doubled" not in told and f"{scale:g} m a unit" in told
 
 
 def test_a_refused_garment_is_drawn_though_the_folder_of_its_file_is_missing(tmp_path, capsys):

@@ -14,7 +14,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import upright
 from ncs_jax.io.mesh.polygons import triangulate
 from ncs_jax.io.packaged import packaged
-from ncs_jax.prepare.garment_checks import check_on_body, summarise_surface
+from ncs_jax.prepare.garment_checks import check_on_body, doubled, summarise_surface
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube
@@ -31,7 +31,7 @@ OUTLINES = {
 }
 
 
-def doubled(x, faces, normal):
+def twice_area(x, faces, normal):
     """Twice the area of triangles as seen from a normal; below 0 for one that is folded back."""
     a, b, c = (x[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) @ normal
@@ -50,7 +50,7 @@ def test_polygons_do_not_fold(name):
     for turned in range(len(OUTLINES[name])):
         x, area = outline(name, turned, matrix)
         faces = triangulate(Path("a"), x, np.array([len(x)]), np.arange(len(x)))
-        sizes = doubled(x, faces, matrix[:, 2])
+        sizes = twice_area(x, faces, matrix[:, 2])
         assert len(faces) == len(x) - 2 and (sizes > 1e-6).all() and sizes.sum() == pytest.approx(area)
 
 
@@ -62,7 +62,7 @@ def test_random_polygons_do_not_fold(rng):
         if np.diff(angle, append=angle[0] + 2 * np.pi).max() > 3:  # then the middle is outside
             continue
         faces = triangulate(Path("a"), flat, np.array([n]), np.arange(n))
-        sizes, area = doubled(flat, faces, [0, 0, 1.0]), np.cross(flat, np.roll(flat, -1, axis=0))[:, 2].sum()
+        sizes, area = twice_area(flat, faces, [0, 0, 1.0]), np.cross(flat, np.roll(flat, -1, axis=0))[:, 2].sum()
         assert sizes.min() > -1e-9 and sizes.sum() == pytest.approx(area)
 
 
@@ -71,7 +71,7 @@ def test_many_polygons_keep_their_order_and_convex_ones_are_fans():
     corners = [0, 1, 2, 3, 3, 2, 4, 1, 5, 6, 7, 2]
     faces = triangulate(Path("a"), x, np.array([4, 3, 5]), np.array(corners))
     assert faces[:3].tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 4]] and set(faces[3:].ravel().tolist()) == {1, 5, 6, 7, 2}
-    assert (doubled(x, faces, [0, 0, 1.0]) > 0).all()
+    assert (twice_area(x, faces, [0, 0, 1.0]) > 0).all()
     assert triangulate(Path("a"), x, np.array([4, 3, 5]), np.array(corners), skip=[0, 7]).tolist() == faces[2:].tolist()
 
 
@@ -134,7 +134,7 @@ def test_a_concave_polygon_in_a_file(tmp_path, suffix):
     else:
         (tmp_path / "g.ply").write_bytes(ply("ascii", x.tolist(), [list(range(len(x)))]))
     record = io.read_garment(tmp_path / f"g.{suffix}")
-    sizes = doubled(record.vertices, record.faces, [0, 0, 1.0])
+    sizes = twice_area(record.vertices, record.faces, [0, 0, 1.0])
     assert (sizes > 0).all() and sizes.sum() == pytest.approx(area)
     np.testing.assert_allclose(record.vertices, x)
 
@@ -205,7 +205,7 @@ def test_usd_meshes_that_face_the_other_way(tmp_path):
     assert len(io.read_garment(tmp_path / "g.usda", mesh=["b"]).vertices) == 8
     record = io.read_garment(tmp_path / "g.usda", mesh=["a", "b", "/c"])
     assert record.vertices.shape == (24, 3) and record.faces.shape == (12, 3)
-    sizes = doubled(record.vertices, record.faces, [0, 0, 1.0])
+    sizes = twice_area(record.vertices, record.faces, [0, 0, 1.0])
     np.testing.assert_allclose(sizes, 1)  # what is outside stays outside, also in a mirror
 
 
@@ -273,6 +273,33 @@ def test_formats_that_split_vertices_are_welded_where_they_are_at_one_place(tmp_
     assert record.welded == 3 * len(faces) - len(x) - 3 + sum(np.sum(faces == v) == 1 for v in faces[-1])
     assert summarise_surface(record.vertices, record.faces).components == 2
     assert io.read_garment(tmp_path / f"g.{suffix}", weld=5e-4).vertices.shape == x.shape
+
+
+@pytest.mark.parametrize("suffix", ["stl", "glb"])
+def test_triangles_that_draw_nothing_are_left_out_where_a_format_splits_vertices(tmp_path, suffix):
+    import trimesh
+
+    x, faces = sheet(spacing=0.1)
+    line = np.array([[0, 1, 2]]) + len(x[faces].reshape(-1, 3))  # with two corners where one vertex is
+    split = np.concatenate([x[faces].reshape(-1, 3), x[[faces[3, 0], faces[3, 0], faces[3, 1]]]])
+    corners = np.concatenate([line, np.arange(3 * len(faces)).reshape(-1, 3)])
+    trimesh.Trimesh(split, corners, process=False).export(tmp_path / f"g.{suffix}")
+    record = io.read_garment(tmp_path / f"g.{suffix}", weld=1e-6)
+    assert record.vertices.shape == x.shape and record.notes[0].startswith("1 triangles with two corners at one place")
+    np.testing.assert_allclose(record.vertices[record.faces], x[faces], atol=1e-6)
+
+
+def test_vertices_that_rounding_has_split_are_counted():
+    x, faces = sheet(spacing=0.1)
+    apart = x[faces].reshape(-1, 3)
+    soup = np.arange(len(apart)).reshape(-1, 3)
+    assert doubled(x, faces) == 0
+    for noise in (0, 1e-7):
+        noisy = apart + noise * np.random.default_rng(0).uniform(-1, 1, apart.shape)
+        assert doubled(noisy, soup) == len(apart) - len(x)
+    near = x.copy()
+    near[faces[0, 1]] = near[faces[0, 0]] + [1e-7, 0, 0]  # joined by an edge: nothing comes apart
+    assert doubled(near, faces) == 0
 
 
 # --- what a surface is made of ----------------------------------------------------------------------------------------------

@@ -208,6 +208,17 @@ def test_garment_obj_with_a_texture_seam_is_not_split(tmp_path):
     assert record.uv is None and "1 triangles have no texture coordinates" in record.notes[0]
 
 
+def test_garment_obj_whose_faces_stand_above_their_vertices(tmp_path):
+    lines = OBJ.replace("\\\n", "").splitlines()
+    (tmp_path / "g.obj").write_text(OBJ)
+    first = [line for line in lines if line.startswith("f 1")] + ["f 4/4 3/3 5/5"]
+    (tmp_path / "above.obj").write_text("\n".join([*first, *(line for line in lines if not line.startswith("f"))]))
+    found, expected = (io.read_garment(tmp_path / name) for name in ("above.obj", "g.obj"))
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_array_equal(found.uv, expected.uv)
+
+
 @pytest.mark.parametrize("name", ["a", "a.glb", "a.usdc"])
 def test_texture_seams_are_written_and_read_again(tmp_path, name):
     if name.endswith("usdc"):
@@ -245,6 +256,27 @@ def test_garment_ply_polygons_are_cut(tmp_path):
     record = io.read_garment(tmp_path / "g.ply")
     assert len(record.faces) == 3
     np.testing.assert_allclose(record.vertices[4], [0.5, 2, 0])
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_garment_ply_whose_header_has_lines_of_any_system(tmp_path, end):
+    """The data begin with the byte of a newline."""
+    head = "ply\nformat binary_big_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+    x = np.array([[np.frombuffer(b"\n\0\0\0", ">f4")[0], 0, 0], [1, 0, 0], [0, 1, 0]], ">f4")
+    (tmp_path / "g.ply").write_bytes(head.replace("\n", end).encode() + x.tobytes() + struct.pack(">Biii", 3, 0, 1, 2))
+    np.testing.assert_array_equal(io.read_garment(tmp_path / "g.ply").vertices, x)
+
+
+def test_garment_stl_with_more_bytes_behind_its_triangles(tmp_path):
+    import trimesh
+
+    trimesh.Trimesh(*STRIP, process=False).export(tmp_path / "g.stl")
+    data = (tmp_path / "g.stl").read_bytes()
+    (tmp_path / "g.stl").write_bytes(data + b"\0\0")
+    record = io.read_garment(tmp_path / "g.stl")
+    np.testing.assert_allclose(record.vertices, STRIP[0])
+    np.testing.assert_array_equal(record.faces, STRIP[1])
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
@@ -641,10 +673,10 @@ def Mesh "m"
 GARMENTS = {
     "empty.obj": (b"", "an empty file"),
     "no_mesh.obj": (b"# nothing\n", "a mesh with vertices and triangles"),
-    "corner.obj": (OBJ.replace("1/1/1 2/2/1", "1/1/1 9/2/1").encode(), "faces, line 16: a vertex from 1 to 4 .*found 9"),
+    "corner.obj": (OBJ.replace("1/1/1 2/2/1", "1/1/1 9/2/1").encode(), "faces, line 16: a vertex from 1 to 5 .*found 9"),
     "zero.obj": (OBJ.replace("1/1/1 2/2/1", "0/1/1 2/2/1").encode(), "faces, line 16: .*found 0"),
     "before.obj": (OBJ.replace("f -2/-2", "f -9/-2").encode(), "faces, line 19: .*found -9"),
-    "texture.obj": (OBJ.replace("1/1/1 2/2/1", "1/1/1 2/8/1").encode(), "a texture coordinate from 1 to 4"),
+    "texture.obj": (OBJ.replace("1/1/1 2/2/1", "1/1/1 2/8/1").encode(), "a texture coordinate from 1 to 5"),
     "word.obj": (OBJ.replace("1/1/1 2/2/1", "1/1/1 two").encode(), "v/vt/vn expected.*two"),
     "number.obj": (OBJ.replace("v 1 1 0", "v 1 l 0").encode(), "line 6: 3 finite numbers expected"),
     "two.obj": (OBJ.replace("v 1 1 0", "v 1 1").encode(), "line 6: 3 finite numbers expected"),

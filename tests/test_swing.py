@@ -393,6 +393,20 @@ def test_what_is_fitted_is_a_map_of_the_descriptors_and_keeps_to_what_was_found(
     np.testing.assert_array_equal(told(None, d), np.tile(np.eye(modes), (poses, 1, 1)))
 
 
+@pytest.mark.parametrize("noise", [0, 1e-7])
+def test_poses_that_are_all_alike_have_one_stiffness(noise):
+    """A body that only turns about gravity has one pose: the descriptors differ by rounding, which tells nothing."""
+    rng, poses = np.random.default_rng(2), 20
+    d = np.tile(rng.uniform(-1, 1, 5), (poses, 1)) + noise * rng.standard_normal((poses, 5))
+    found = np.tile(np.diag([1.0, 2.0, 3.0]), (poses, 1, 1)) * rng.uniform(0.9, 1.1, (poses, 1, 1))
+    by_pose = fitted(d, found)
+    assert not by_pose[:5].any() and np.isfinite(by_pose).all()
+    vibrations = RitzModes(jnp.zeros((4, 3, 3)), jnp.asarray(1.0), by_pose=jnp.asarray(by_pose))
+    middle = np.exp(np.mean(np.log(found[:, range(3), range(3)]), axis=0))
+    told = stiffness(vibrations, jnp.asarray(d)[:, None])
+    np.testing.assert_allclose(np.moveaxis(told, -1, 0), np.tile(np.diag(middle), (poses, 1, 1)), rtol=1e-6, atol=1e-12)
+
+
 def test_in_how_many_poses_a_training_looks():
     assert [poses_of(steps) for steps in (250, 256, 1000, 2000, 100_000)] == [0, 16, 16, 31, 128]
 

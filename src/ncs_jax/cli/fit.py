@@ -24,6 +24,7 @@ MOTIONS = (
     *("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance"),
     *(f"cmu_{name}" for name in ("walk", "walk_fast", "run", "dance", "spin", "turn", "ball", "stand")),
 )
+HOLES = 10  # so many small ones are listed
 LIMBS = {"left arm", "right arm", "left thigh", "right thigh"}  # whose joints the packaged motions must find
 
 
@@ -83,12 +84,10 @@ def fit(options) -> int:
     from ncs_jax import io
     from ncs_jax.io.tables.files import check_place
     from ncs_jax.prepare.fit import check_length, settle
-    from ncs_jax.prepare.garment_placement import place
-    from ncs_jax.prepare.skinning_weights import with_body_weights
 
     for name in ("clearance", "weld"):
         check_length(f"--{name}", getattr(options, name))
-    out, scene = Path(options.out), Scene()
+    out = Path(options.out)
     if out.suffix.lower() != ".npz":
         raise InputError(
             "a name that ends in .npz expected", field="--out", value=options.out, mend="no other format here holds weights"
@@ -96,19 +95,17 @@ def fit(options) -> int:
     if check_place(out).is_dir():
         raise InputError("a file expected", field="--out", value=options.out, mend="give another name")
     arguments.check_not_read(options.out, options.garment, options.body, *filter(None, [options.source]))
-    body, unit = arguments.body_of(options), {"scale": options.scale, "up": options.up.removeprefix("-"), "weld": options.weld}
+    body = arguments.body_of(options)
     source = io.read_body(options.source) if options.source else body
-    with arguments.as_options():
-        given = io.read_garment(scene.path(options.garment), **unit, mesh=options.mesh, turn_faces=True)
-    given = with_body_weights(given, source)
-    known = {"scale": options.scale or None, "up": options.up or None, "turn": options.turn}
-    move = (0.0, 0.0, 0.0) if options.stay else options.move
-    placement = place(options.garment, given, source, move=move, **known)
+    given, placement = _placed(options, source, options.scale)
+    if options.weld and placement.scale != given.scale:  # it was read before it was known how far a metre is
+        given, placement = _placed(options, source, placement.scale)
     print(
         f"{options.garment} on {options.source or options.body}: {len(given.vertices)} vertices, {len(given.faces)} triangles"
     )
     for note in given.notes:
         print(f"  note      {note}")
+    _say_doubled(given, placement.scale / given.scale)
     _say_where(placement)
     picture = out.with_suffix(".png")
     if options.source:
@@ -134,6 +131,23 @@ def fit(options) -> int:
         first = "name its motions there, then " if "files = []" in text else ""
         print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: {first}ncs check {name}, then {after}")
     return 0
+
+
+def _placed(options, body, scale: float):
+    """Return the garment as read, in so many metres a unit (0: as the file says), and its place on the body."""
+    from ncs_jax import io
+    from ncs_jax.prepare.garment_placement import place
+    from ncs_jax.prepare.skinning_weights import with_body_weights
+
+    with arguments.as_options():
+        given = io.read_garment(
+            Scene().path(options.garment), scale=scale, up=options.up.removeprefix("-"), weld=options.weld, mesh=options.mesh,
+            turn_faces=True,
+        )  # fmt: skip
+    given = with_body_weights(given, body)
+    move = (0.0, 0.0, 0.0) if options.stay else options.move
+    known = {"scale": scale or None, "up": options.up or None, "turn": options.turn}
+    return given, place(options.garment, given, body, move=move, **known)
 
 
 @contextmanager
@@ -167,6 +181,15 @@ def _carried(options, picture: Path, placement, source, body):
     with _drawn(picture, body, after):
         found.check(options.garment, placement, after)
     return after
+
+
+def _say_doubled(given, unit: float) -> None:
+    """Print how many vertices of a garment as read, in metres a unit, lie at another's place, and what joins them."""
+    from ncs_jax.prepare.garment_checks import TOGETHER, doubled
+
+    if count := doubled(unit * given.vertices.astype(float), given.faces):
+        print(f"  doubled   {count} vertices lie where another one is and share no edge with it: cloth comes apart there;")
+        print(f"            --weld {TOGETHER:g} joins them")
 
 
 def _say_where(placement) -> None:
@@ -209,8 +232,14 @@ def _say_what(found, given) -> None:
     print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
     _say_contact(found.contact)
     print(f"  surface   connected components {parts.components}, degenerate triangles {parts.degenerate}")
+    small = [opening for opening in parts.openings if opening.small]
     for opening in parts.openings:
-        print(f"  hole      a small one, {opening}: meant?" if opening.small else f"  opening   {opening}")
+        if not opening.small:
+            print(f"  opening   {opening}")
+    for opening in small[:HOLES]:
+        print(f"  hole      a small one, {opening}: meant?")
+    if len(small) > HOLES:
+        print(f"  hole      and {len(small) - HOLES} more small ones")
     if PINS in given.groups:
         print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:

@@ -8,13 +8,24 @@ from pathlib import Path
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.geometry.mesh import LINE, relative_heights
+from ncs_jax.geometry.mesh import LINE, relative_heights, topology
 from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["FAR", "UNITS", "Hole", "SurfaceSummary", "check_apart", "check_on_body", "distance_outside", "summarise_surface"]
+__all__ = [
+    "FAR",
+    "TOGETHER",
+    "UNITS",
+    "Hole",
+    "SurfaceSummary",
+    "check_apart",
+    "check_on_body",
+    "distance_outside",
+    "doubled",
+    "summarise_surface",
+]
 
 UNITS = {
     0.01: "centimetres",
@@ -32,6 +43,7 @@ UNITS = {
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
 LIKELY = 3  # units that are named
+TOGETHER = 1e-5  # m: vertices that are nearer were one, and a format or its rounding has split them
 NAMED = 2  # pairs of triangles that pass through each other
 SMALL = 0.12  # m: no head, hand or foot passes through a shorter opening,
 FEW, SHORT = 6, 0.25  # nor is one of so few edges meant that is so much shorter than the longest
@@ -72,6 +84,22 @@ def check_apart(file: str | Path, garment: GarmentRecord) -> None:
         value=f"{len(found)} pairs: {'; '.join(places[:NAMED])}",
         mend="bring its layers apart there in a modeller; small folds ncs fit smooths by itself",
     )  # fmt: skip
+
+
+def doubled(x: np.ndarray, faces: np.ndarray) -> int:
+    """Return how many vertices (V, 3), m, lie where another one is, or within `TOGETHER` of one with which they share no edge:
+    cloth comes apart there, as in files that store a vertex once for each face.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    kept, place = np.unique(x, axis=0, return_inverse=True)  # first: any number of vertices may lie at one place
+    edges = np.sort(place.reshape(-1)[topology(faces)[0]], axis=1).astype(np.int64) @ [len(kept), 1]
+    pairs = np.sort(cKDTree(kept).query_pairs(TOGETHER, output_type="ndarray"), axis=1)
+    a, b = pairs[~np.isin(pairs @ [len(kept), 1], edges)].T
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(kept), len(kept)))
+    return len(x) - int(connected_components(graph, directed=False)[0])
 
 
 def summarise_surface(x: np.ndarray, faces: np.ndarray) -> SurfaceSummary:

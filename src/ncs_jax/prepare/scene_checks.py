@@ -20,6 +20,7 @@ from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
+from ncs_jax.prepare.garment_checks import TOGETHER, doubled
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
@@ -117,9 +118,9 @@ def _mesh(a: Setting) -> Iterator[Risk]:
     if len(through := crossing_pairs(x, faces)):
         value = f"{len(through)} pairs of triangles, first {through[0, 0]} and {through[0, 1]}"
         yield Risk("garment through itself at rest", value, "it stays so", "ncs fit smooths small folds, else bring it apart")
-    twice = len(x) - len(np.unique(x, axis=0))
-    if twice:
-        yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", "garment.weld = 1e-6")
+    if twice := doubled(x, faces):
+        mend = f"garment.weld = {TOGETHER:g}"
+        yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", mend)
 
 
 def _grain(a: Setting) -> Iterator[Risk]:

@@ -78,6 +78,13 @@ def facts_of_run(out: Path | None, resume: bool, terms: Sequence[OwnTerm], netwo
     if not resume:
         raise InputError("a new folder expected", file=out, value="a run", mend="add --resume, or choose another --out")
     facts = read_run(out)
+    if adapted := facts.get("adapted"):  # its scene has other motions than what its network was made for
+        motions = " ".join(f"--motion {name}" for name in adapted["motions"])
+        again = f"`ncs animate {facts['start']} {motions} --adapt SECONDS --adapted {out} --out FILE` goes on with it"
+        raise InputError(
+            "a run that was not adapted expected", file=out, value=f"one adapted for {adapted['seconds']:g} s",
+            mend=f"{again}, with more of them; a new run begins from its weights with --from {out}",
+        )  # fmt: skip
     check_own(facts, out, terms, network)
     return facts
 
@@ -97,14 +104,14 @@ def resumed_scene(facts: dict, out: Path, scene: Scene | None, seed: int | None,
             from a run and has no checkpoint.
     """
     if seed is not None and seed != facts["seed"]:
-        raise InputError("a run keeps its seed", file=out, field="seed", value=seed, mend="leave it out, or begin a new run")
+        raise InputError("a run keeps its seed", file=out, field="--seed", value=seed, mend="leave it out, or begin a new run")
     done = Checkpoints(out).latest()
     if done is None and facts.get("start"):
         raise InputError("no checkpoint there yet", file=out, mend="delete this folder and begin anew")
     if steps is not None and steps < (done or 0):
         mend = "give more, or begin a new run"
         raise InputError(
-            f"at least the {done} steps that the run has expected", file=out, field="steps", value=steps, mend=mend
+            f"at least the {done} steps that the run has expected", file=out, field="--steps", value=steps, mend=mend
         )
     kept = scene_from(facts["scene"], source=str(out / "run.json"))
     if (out / "prepared.npz").exists():  # else it was killed before that was written

@@ -24,6 +24,7 @@ MOST = 128  # poses: by then the map explains 3 quarters of what differs between
 FEWEST = 16  # poses that a map is fitted to
 STEPS = 64  # of training for each pose, so that they take about a twentieth of its time
 SHARE = 4  # times as much of a short training may go into `FEWEST`; a shorter one leaves it out
+ALIKE = 1e-4  # of their size: descriptors that differ by less are of one pose, as of a body that only turns about gravity
 RIDGES = 10.0 ** np.arange(-4, 3)  # of the mean square of the descriptors
 
 
@@ -76,7 +77,10 @@ def with_vibrations(assembly: Assembly, vibrations: RitzModes) -> Assembly:
 def fitted(
     descriptors: Float[np.ndarray, "poses numbers"], stiffness: Float[np.ndarray, "poses modes modes"]
 ) -> Float[np.ndarray, "rows entries"] | None:
-    """Return the map of `RitzModes.by_pose` that ridge regression gives; None where no `FEWEST` of them are definite."""
+    """Return the map of `RitzModes.by_pose` that ridge regression gives; None where no `FEWEST` of them are definite.
+
+    In poses that are all `ALIKE` the garment is as stiff as it is on average: what differs then is rounding.
+    """
     good = np.isfinite(stiffness).all(axis=(1, 2))
     good[good] = np.linalg.eigvalsh(stiffness[good])[:, 0] > 0
     if good.sum() < FEWEST:
@@ -88,7 +92,10 @@ def fitted(
     middle = d.mean(axis=0)
     d = d - middle
     gram = d @ d.T
-    scale = max(np.trace(gram) / len(gram), np.finfo(float).tiny)
+    scale = float(np.trace(gram)) / len(gram)
+    if scale <= ALIKE**2 * np.mean(np.sum(descriptors[good] ** 2, axis=1)):
+        slopes = np.zeros((d.shape[1], y.shape[1]))
+        return np.vstack([slopes, entries.mean(axis=0), entries.min(axis=0), entries.max(axis=0)])
 
     def left_out(ridge: float) -> float:
         """The square of what each pose's entries differ from by what the others tell of them."""

@@ -153,7 +153,7 @@ def train_assembly(
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
     """Raise an InputError where two options exclude each other."""
     if steps is not None and minutes is not None:
-        raise InputError("either steps or minutes expected", field="minutes", value=minutes, mend="leave one of them out")
+        raise InputError("either steps or minutes expected", field="--minutes", value=minutes, mend="leave one of them out")
     if resume and start is not None:
         raise InputError("a run that is resumed has weights", field="--from", value=str(start), mend="leave it out")
 

@@ -48,7 +48,8 @@ def read_garment(
     .npz holds `vertices` (V, 3) and `faces` (F, 3), and may hold `uv` (V, 2) of vertices or (F, 3, 2) of corners, vertex sets
     `group_NAME`, and skinning weights `blend_weights` (V, J) for the body's joints. A skinned garment of a .glb or .fbx brings
     the weights of its own joints. Vertices keep the file's order and number, but for .stl and glTF, which store a vertex many
-    times: there, vertices at exactly one place are merged, in order of first appearance. Polygons become triangles that do not
+    times: there, vertices at exactly one place are merged, in order of first appearance, and triangles that have two corners
+    there are left out. Polygons become triangles that do not
     fold, see `triangulate`.
 
     Args:
@@ -69,17 +70,21 @@ def read_garment(
     faces = corners = indices(file, "faces", raw.faces, ("F", 3), verts, "vertices")
     unit, axis = scale or raw.unit, up or raw.up
     x = floats(file, "vertices", upright(x, unit, axis), ("V", 3), ("vertex",))
+    uv, notes = raw.uv, raw.notes
+    if raw.splits and (point := (x[faces] == np.roll(x[faces], 1, axis=1)).all(axis=2).any(axis=1)).any():
+        faces = corners = faces[~point]
+        uv = uv[~point] if uv is not None and uv.ndim == 3 and len(uv) == len(point) else uv
+        notes = (*notes, f"{point.sum()} triangles with two corners at one place are left out: they draw nothing")
     kept = number = np.arange(verts)
     if (weld > 0 or raw.splits) and verts:
         kept, number = same_places(file, x, faces, weld)
         x, faces = x[kept], number[faces].astype(np.int32)
-    notes = raw.notes
     if turn_faces:
         faces, turned = oriented(file, x, faces)
         told = f"{len(turned)} of {len(faces)} triangles faced the other side than their neighbours, the first is face "
         notes = (*notes, told + f"{turned[0]}: they were turned") if len(turned) else notes
     check_surface(file, faces, len(x))
-    uv, weights = raw.uv, raw.weights
+    weights = raw.weights
     if uv is not None and uv.ndim == 2:  # of the vertices
         uv = floats(file, "uv", uv, (verts, 2), ("vertex",))[corners]
     elif uv is not None:

@@ -67,6 +67,7 @@ def polygons_of(path: str | Path) -> Polygons:
     corners: list[tuple[int, int]] = []  # (vertex, texture coordinate)
     names = {"o": "", "g": "", "usemtl": ""}
     labels: list[tuple[str, str, str]] = []  # of each polygon
+    lines: list[int] = []
     for line, words in _lines(text):
         if words[0] == "v":
             vertices.append(_numbers(file, line, words, 3))
@@ -77,12 +78,24 @@ def polygons_of(path: str | Path) -> Polygons:
             if len(polygon) < 3:
                 raise InputError("three corners or more expected", file=file, field=f"line {line}", value=" ".join(words)[:60])
             counts.append(len(polygon))
+            lines.append(line)
             corners.extend(polygon)
             labels.append((names["o"], names["g"], names["usemtl"]))
         elif words[0] in names:
             names[words[0]] = " ".join(words[1:])
     x, uv = np.array(vertices, np.float64).reshape(-1, 3), np.array(coordinates, np.float64).reshape(-1, 2)
-    return Polygons(file, x, uv, np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2), labels)
+    count, corner = np.array(counts, np.int64), np.array(corners, np.int64).reshape(-1, 2)
+    for k, (what, there) in enumerate((("vertex", x), ("texture coordinate", uv))):
+        beyond = np.flatnonzero(corner[:, k] >= len(there))
+        if len(beyond):
+            raise _no_such(
+                file,
+                lines[int(np.repeat(np.arange(len(count)), count)[beyond[0]])],
+                what,
+                len(there),
+                int(corner[beyond[0], k]) + 1,
+            )
+    return Polygons(file, x, uv, count, corner, labels)
 
 
 def _chosen(file: Path, mesh: Sequence[str], labels: list, owner: np.ndarray, corner: np.ndarray) -> np.ndarray:
@@ -133,7 +146,10 @@ def _numbers(file: Path, line: int, words: list[str], count: int) -> list[float]
 
 
 def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -> tuple[int, int]:
-    """Return a corner's vertex and texture coordinate, from 0 (-1: none), of `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
+    """Return a corner's vertex and texture coordinate, from 0 (-1: none), of `v`, `v/vt`, `v//vn` or `v/vt/vn`.
+
+    vertices, coordinates: how many stand above it, from which negative numbers count back.
+    """
     parts = word.split("/")
     try:
         vertex = int(parts[0])
@@ -141,20 +157,22 @@ def _corner(file: Path, line: int, word: str, vertices: int, coordinates: int) -
     except ValueError:
         raise InputError("v, v/vt, v//vn or v/vt/vn expected", file=file, field=f"line {line}", value=word[:60]) from None
     v = vertex - 1 if vertex > 0 else vertices + vertex
-    if vertex == 0 or not 0 <= v < vertices:
-        raise InputError(
-            f"a vertex from 1 to {vertices} expected, one listed above", file=file, field=f"faces, line {line}", value=vertex,
-            mend="counting starts at 1; export the mesh again",
-        )  # fmt: skip
+    if vertex == 0 or v < 0:
+        raise _no_such(file, line, "vertex", vertices, vertex)
     if coordinate is None:
         return v, -1
     t = coordinate - 1 if coordinate > 0 else coordinates + coordinate
-    if coordinate == 0 or not 0 <= t < coordinates:
-        raise InputError(
-            f"a texture coordinate from 1 to {coordinates} expected, one listed above", file=file, field=f"faces, line {line}",
-            value=coordinate, mend="export the mesh again, or without texture coordinates",
-        )  # fmt: skip
+    if coordinate == 0 or t < 0:
+        raise _no_such(file, line, "texture coordinate", coordinates, coordinate)
     return v, t
+
+
+def _no_such(file: Path, line: int, what: str, count: int, found: int) -> InputError:
+    """Return the error of a corner that names a vertex or a texture coordinate that the file does not have."""
+    return InputError(
+        f"a {what} from 1 to {count} expected, or from -{count} to -1", file=file, field=f"faces, line {line}", value=found,
+        mend="counting starts at 1; export the mesh again" + ("" if what == "vertex" else ", or without texture coordinates"),
+    )  # fmt: skip
 
 
 def obj_faces(faces: np.ndarray, uv: np.ndarray | None) -> str:

@@ -69,8 +69,9 @@ def read_ply(path: str | Path) -> RawGarment:
 def _header(file: Path, data: bytes) -> tuple[str, list[_Element], int]:
     """Return the byte order ("" for text), the elements, and where the data begin."""
     end = data.find(b"end_header")
-    stop = data.find(b"\n", end) + 1
-    if not data.startswith(b"ply") or end < 0 or stop == 0:
+    mark = next((m for m in (b"\r\n", b"\n", b"\r") if data.startswith(b"ply" + m)), b"\n")  # ends every line of the header
+    stop = data.find(mark, end) + len(mark)
+    if not data.startswith(b"ply") or end < 0 or stop < end:
         raise InputError("a header from ply to end_header expected", file=file, field="header", mend="export it again")
     order, elements = None, list[_Element]()
     for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]:
