@@ -99,4 +99,4 @@ def shaped(value, last: tuple[int, ...], field: str, what: str, mend: str | None
 
 def _short(value: object, limit: int = 80) -> str:
     text = repr(value).replace("\n", " ")
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    return text if len(text) <= limit else f"{text[: limit // 2 - 3]}...{text[-limit // 2 :]}"  # a path tells most at its end

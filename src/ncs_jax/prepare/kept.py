@@ -52,5 +52,5 @@ def _key(given) -> str:
         digest.update(path.read_bytes())
     for leaf in map(np.asarray, leaves):
         digest.update(f"{leaf.dtype} {leaf.shape}".encode())
-        digest.update(np.ascontiguousarray(leaf))
+        digest.update(np.ascontiguousarray(leaf).data)
     return digest.hexdigest()

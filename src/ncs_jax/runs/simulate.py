@@ -154,10 +154,10 @@ def simulate(
         name = str(Path(name).absolute())
     fine = scene.motion.fps * scene.simulation.substeps
     # What can be touched is found out from this motion.
-    alone = {"files": (), "own": {}} if name is None else {"files": (name,), "own": {name: scene.own_settings(name)}}
+    own = {} if name is None else {name: scene.own_settings(name)}
     lone = replace(
         scene.without_network(),
-        motion=replace(scene.motion, **alone, validation=(), fps=fine, mirror=False, lone=True),
+        motion=replace(scene.motion, files=tuple(own), own=own, validation=(), fps=fine, mirror=False, lone=True),
     )
     precision = scene.simulation.precision
     if precision != "double":
