@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.axes import upright
 from ncs_jax.io.mesh.polygons import triangulate
 from ncs_jax.io.packaged import packaged
-from ncs_jax.prepare.garment_checks import check_on_body, doubled, summarise_surface
+from ncs_jax.prepare.garment_checks import check_on_body, doubled, fine_folds, summarise_surface
+from ncs_jax.scene.spec import BendingSpec, PhysicsSpec, SelfContactSpec
 
 from .scenes import grid, post, write_scene
 from .shapes import ball, rotation, sheet, tube
@@ -476,3 +478,16 @@ def test_check_says_what_a_garment_is_made_of(tmp_path, capsys):
     assert main(["check", str(scene)]) == 0
     text = capsys.readouterr().out
     assert "connected components 1, openings 1" in text and "90 vertices welded to others" in text
+
+
+def test_a_loose_garment_is_told_when_its_folds_are_finer_than_its_triangles():
+    """A sheet with edges of 5 cm, 10 cm off the skin; stiffer; mostly nearer; of 2 cm; kept apart; in free fall."""
+    x, faces = grid(11, 11, 0.05)
+    away, physics = np.full(len(x), 0.1), PhysicsSpec()
+    found = fine_folds(x, faces, away, physics)
+    assert found is not None and 0.018 < found.length < 0.02 and np.isclose(found.edge, 0.05)
+    assert fine_folds(x, faces, away, replace(physics, bending=BendingSpec(found.stiffness))) is None
+    assert fine_folds(x, faces, np.where(np.arange(len(x)) % 6, 0.01, away), physics) is None
+    assert fine_folds(0.4 * x, faces, away, physics) is None
+    assert fine_folds(x, faces, away, replace(physics, self_contact=SelfContactSpec(20.0))) is None
+    assert fine_folds(x, faces, away, replace(physics, gravity=(0.0, 0.0, 0.0))) is None

@@ -279,6 +279,7 @@ def _draw(picture: Path, body, faces: np.ndarray, cloths: dict[str, np.ndarray])
 def _scene(options, out: Path, found, body) -> str:
     """Return a whole scene for the fitted garment: with the packaged motions where the body's joints can be told apart."""
     from ncs_jax.prepare.fit import PINS
+    from ncs_jax.prepare.garment_checks import fine_folds
     from ncs_jax.prepare.joint_names import anatomy
     from ncs_jax.prepare.retarget import body_names, called
 
@@ -300,6 +301,12 @@ def _scene(options, out: Path, found, body) -> str:
     contact, usual = found.contact, Scene().physics.collision
     told = [f"{n} = {getattr(contact, n):g}" for n in ("thickness", "stiffness") if getattr(contact, n) != getattr(usual, n)]
     told = [f"{told[0]}  # for edges of {1000 * contact.edge:.0f} mm, else skin shows between them", *told[1:]] if told else []
+    g = found.garment
+    if fine := fine_folds(g.vertices.astype(float), g.faces, -found.depth[1], Scene().physics):
+        why = (
+            f"# with {Scene().physics.bending.stiffness:g} its folds are finer than its triangles, and pass through each other"
+        )
+        lines += ["", "[physics.bending]", f"stiffness = {fine.stiffness:g}  {why}"]
     lines += ["", "[physics.collision]", *told, 'points = "auto"'] if told else []
     if body.frames is None:
         lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5"]

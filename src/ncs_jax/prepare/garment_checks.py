@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import GarmentRecord
+from ncs_jax.scene.spec import PhysicsSpec
 
 __all__ = [
     "FAR",
@@ -24,6 +26,7 @@ __all__ = [
     "check_on_body",
     "distance_outside",
     "doubled",
+    "fine_folds",
     "summarise_surface",
 ]
 
@@ -43,6 +46,8 @@ UNITS = {
 FAR = 0.1  # of the body's size: a garment that stands out of the body's box by more is not on the body
 NEAR = 0.03  # of the body's size: one that stands out by less is
 LIKELY = 3  # units that are named
+LOOSE, MUCH = 0.06, 0.2  # m; cloth that is farther from the skin is loose, and so much of a garment makes it a loose one
+FINE, WIDE = 0.5, 0.8  # of an edge: shorter folds pass through each other, and so long ones do not
 TOGETHER = 1e-5  # m: vertices that are nearer were one, and a format or its rounding has split them
 NAMED = 2  # pairs of triangles that pass through each other
 SMALL = 0.12  # m: no head, hand or foot passes through a shorter opening,
@@ -84,6 +89,29 @@ def check_apart(file: str | Path, garment: GarmentRecord) -> None:
         value=f"{len(found)} pairs: {'; '.join(places[:NAMED])}",
         mend="bring its layers apart there in a modeller; small folds ncs fit smooths by itself",
     )  # fmt: skip
+
+
+class FineFolds(NamedTuple):
+    """Folds finer than triangles: their length and that of an edge, m, and the bending stiffness, N m, that widens them."""
+
+    length: float
+    edge: float
+    stiffness: float
+
+
+def fine_folds(x: np.ndarray, faces: np.ndarray, away: np.ndarray, physics: PhysicsSpec) -> FineFolds | None:
+    """Return how loose cloth (V, 3), so far from the skin (V,), m, would pass through itself; None where it does not.
+
+    Under its weight cloth folds at a length of (k_b / (density g))^(1/3). Where that is less than `FINE` of an edge, two
+    triangles fold onto each other, and nothing but contact of the cloth with itself keeps them apart.
+    """
+    weight = physics.density * float(np.linalg.norm(physics.gravity))
+    edges = topology(faces)[0]
+    edge = float(np.median(np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)))
+    length = (physics.bending.stiffness / weight) ** (1 / 3) if weight else np.inf
+    if length >= FINE * edge or physics.self_contact.stiffness > 0 or np.mean(away > LOOSE) < MUCH:
+        return None
+    return FineFolds(length, edge, float(f"{weight * (WIDE * edge) ** 3:.1g}"))
 
 
 def doubled(x: np.ndarray, faces: np.ndarray) -> int:

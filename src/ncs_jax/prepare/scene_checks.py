@@ -16,11 +16,12 @@ import numpy as np
 from ncs_jax.energies.terms import MEMBRANES
 from ncs_jax.errors import required
 from ncs_jax.geometry.mesh import LINE, relative_heights
+from ncs_jax.geometry.surface_distance import border_of, distance_and_direction
 from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io import BodyRecord, MotionRecord
 from ncs_jax.metrics.penetration import depths_on_host
 from ncs_jax.prepare.covering import contact_for, least_thickness, sinking, vertex_share
-from ncs_jax.prepare.garment_checks import TOGETHER, doubled
+from ncs_jax.prepare.garment_checks import TOGETHER, doubled, fine_folds
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import one_by_one
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
@@ -167,6 +168,16 @@ def _shows(a: Setting, faces: np.ndarray) -> Iterator[Risk]:
     stiffness = max(wanted.stiffness, collision.stiffness)
     mend = f"physics.collision: thickness = {wanted.thickness:g}, stiffness = {stiffness:g}, or a finer mesh"
     yield Risk("thickness of the collision", value, "skin shows through the cloth", mend)
+
+
+def _folds(a: Setting) -> Iterator[Risk]:
+    """Yield the risk of a loose garment whose folds are finer than its triangles."""
+    x, body = np.asarray(a.garment.vertices, np.float64), required(a.body, "body")
+    away, _ = distance_and_direction(x, body.vertices, body.faces, border_of(body.faces, len(body.vertices)))
+    if fine := fine_folds(x, np.asarray(a.garment.faces), away, a.scene.physics):
+        value = f"{1000 * fine.length:.0f} mm under its weight, of edges of {1000 * fine.edge:.0f} mm"
+        mend = f"physics.bending.stiffness = {fine.stiffness:g}, or a finer mesh"
+        yield Risk("folds of loose cloth", value, "they are finer than its triangles, and pass through each other", mend)
 
 
 def _worn_below(model: Model, pose: np.ndarray) -> list[np.ndarray]:
@@ -327,7 +338,7 @@ def _looked_for(a: Setting, say: Callable[[str], None]) -> list[Risk]:
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
         found += [Risk(*fault) for fault in wearing_faults(a.garment, body)]
-        found += _shows(a, faces)
+        found += [*_shows(a, faces), *_folds(a)]
     found += [*_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:
         below = "give it room over the garment below where it was made, or fit it with a larger ncs fit --clearance"
