@@ -252,7 +252,7 @@ def test_what_lies_on_top_of_the_body_needs_no_pins(body):
     assert "pins" not in found.garment.groups and found.carried > 0.01
 
 
-@pytest.mark.parametrize(("width", "held"), [(0.04, True), (0.1, False)])
+@pytest.mark.parametrize(("width", "held"), [(0.04, True), (0.12, False)])
 def test_straps_that_friction_alone_keeps_on_shoulders_are_pinned_there(width, held):
     """A strip over skin that faces up, whose ends hang down."""
     along = np.linspace(0, 0.6, 25)
@@ -267,6 +267,8 @@ def test_straps_that_friction_alone_keeps_on_shoulders_are_pinned_there(width, h
     assert carried > 0.01
     middle = np.flatnonzero(lies & (np.abs(x[:, 0] - 0.3) < 0.14))  # the bends look half aside
     assert lies[pins].all() and (np.isin(middle, pins).all() if held else not len(pins))
+    given = io.GarmentRecord(x, faces), np.full(len(x), 0.005), away
+    assert np.isin(middle, pins_of(*given, "shoulders")[0]).all() and not len(pins_of(*given, "none")[0])
 
 
 def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):

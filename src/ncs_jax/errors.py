@@ -97,6 +97,6 @@ def shaped(value, last: tuple[int, ...], field: str, what: str, mend: str | None
         raise InputError("floating-point numbers expected", field=field, value=str(value.dtype), mend="give float32")
 
 
-def _short(value: object, limit: int = 80) -> str:
+def _short(value: object, limit: int = 120) -> str:
     text = repr(value).replace("\n", " ")
     return text if len(text) <= limit else f"{text[: limit // 2 - 3]}...{text[-limit // 2 :]}"  # a path tells most at its end

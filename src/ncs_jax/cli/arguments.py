@@ -177,8 +177,12 @@ def as_options() -> Iterator[None]:
 
 def body_of(options):
     """Return the body that the options of `add_body` mean."""
+    from ncs_jax.prepare.garment_checks import check_body_size
+
     with as_options():
-        return _body_of(options)
+        body = _body_of(options)
+    check_body_size(options.body, body)
+    return body
 
 
 def _body_of(options):

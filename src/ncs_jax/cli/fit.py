@@ -67,6 +67,13 @@ def add_commands(commands) -> None:
         help="move it by this, metres along the body's axes, Y up, once unit and axes are found (default: found)",
     )
     parser.add_argument(
+        "--pins",
+        choices=("found", "shoulders", "top", "none"),
+        default="found",
+        help="what is held to the body, lest it slide off: what lies over shoulders, the band of the highest opening, nothing, "
+        "or what is found to need it (default)",
+    )
+    parser.add_argument(
         "--weld", type=partial(arguments.positive, of="metres"), default=0.0, metavar="M", help="merge vertices within M metres"
     )
     parser.add_argument(
@@ -112,8 +119,8 @@ def fit(options) -> int:
         placement = _carried(options, picture, placement, source, body)
         given = placement.garment
     with _drawn(picture, body, placement):
-        found = settle(options.garment, placement, body, clearance=options.clearance)
-    _say_what(found, given)
+        found = settle(options.garment, placement, body, clearance=options.clearance, pins=options.pins)
+    _say_what(found, given, options.pins)
     io.write_garment(out, found.garment)
     label = "carried over" if options.source else "placed"
     _draw(picture, body, given.faces, {label: placement.garment.vertices, "out of the body": found.garment.vertices})
@@ -217,7 +224,7 @@ def _say_lying(placement) -> None:
     )
 
 
-def _say_what(found, given) -> None:
+def _say_what(found, given, pins: str) -> None:
     """Print what was done to the garment at its place, and what it is made of."""
     import numpy as np
 
@@ -240,14 +247,15 @@ def _say_what(found, given) -> None:
         print(f"  hole      a small one, {opening}: meant?")
     if len(small) > HOLES:
         print(f"  hole      and {len(small) - HOLES} more small ones")
-    if PINS in given.groups:
+    if PINS in given.groups and pins == "found":
         print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:
-        told = "of narrow straps on the shoulders: nothing but friction keeps them there"
-        told = told if found.carried >= CARRIED else "around its highest opening: nothing else carries it"
+        straps = pins == "shoulders" or (pins == "found" and found.carried >= CARRIED)
+        told = "over the shoulders, where nothing but friction keeps them" if straps else "around its highest opening"
         print(f"  pins      {len(g.groups[PINS])} vertices {told}")
     else:
-        print(f"  pins      none: {1e4 * found.carried:.0f} cm^2 lie on skin that faces up")
+        told = "as is said" if pins == "none" else f"{1e4 * found.carried:.0f} cm^2 lie on skin that faces up"
+        print(f"  pins      none: {told}; if it slides off, --pins shoulders or --pins top")
     own = "the file's own" if given.weights is not None else "those of the skin, found when the scene is made ready"
     print(f"  weights   {own}")
 

@@ -60,6 +60,9 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"ncs: {error.as_command}", file=sys.stderr)
         code = 2
+    except BrokenPipeError:  # whoever read what is printed has enough, as `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
     except KeyboardInterrupt:
         given = {name: shlex.quote(value) for name, value in vars(parsed).items() if isinstance(value, str)}
         goes_on = GOES_ON.get(parsed.run, "").format(**given)

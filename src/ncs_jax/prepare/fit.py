@@ -31,7 +31,7 @@ OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away 
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
 CARRIED = 0.01  # m^2; shoulders or straps offer at least so much
 BAND = 0.02  # m; height of a waistband
-OVER, STRAP = 0.08, 0.025  # m; from the top of a garment so far down it lies over shoulders; half the width of a narrow strap
+OVER, STRAP = 0.08, 0.05  # m; from the top of a garment so far down it lies over shoulders; half the width of a wide strap
 MOST = 0.1  # m; no clearance is larger, as no thickness of a scene's collision is, nor vertices that are one farther apart
 
 
@@ -65,12 +65,14 @@ def check_length(field: str, length: float | None) -> None:
     raise InputError(f"metres, {MOST:g} at most, expected", field=field, value=length, mend=f"metres are meant{meant}")
 
 
-def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float | None = None) -> Fitted:
+def settle(
+    file: str | Path, placement: Placement, body: BodyRecord, *, clearance: float | None = None, pins: str = "found"
+) -> Fitted:
     """Push a placed garment out of the body, and pin it. Its own group `pins` and its own weights, if any, are kept.
 
     Args:
         file: the garment's, for errors. placement: from `place`. clearance: least distance of every vertex from the body, m;
-            None: what keeps the skin from showing between vertices, see `covering.contact_for`.
+            None: what keeps the skin from showing between vertices, see `covering.contact_for`. pins: see `pins_of`.
 
     Raises:
         InputError: the place is in doubt, or the garment cannot be pushed out of the body there, or passes through itself; or
@@ -99,8 +101,11 @@ def settle(file: str | Path, placement: Placement, body: BodyRecord, *, clearanc
     placed = replace(placed, vertices=x.astype(placed.vertices.dtype))
     check_apart(file, placed)
     away = _away_from(body, placed.vertices)
-    pins, carried = pins_of(placed, *away)
-    groups = placed.groups if PINS in placed.groups or not len(pins) else {**placed.groups, PINS: pins}
+    held, carried = pins_of(placed, *away, pins)
+    own = pins == "found" and PINS in placed.groups
+    groups = (
+        placed.groups if own else {n: g for n, g in placed.groups.items() if n != PINS} | ({PINS: held} if len(held) else {})
+    )
     depth = -_away_from(body, before)[0], -away[0]
     return Fitted(replace(placed, groups=groups), placement, depth, carried, contact)
 
@@ -179,13 +184,16 @@ def bring_apart(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: f
 # --- pins -----------------------------------------------------------------------------------------------------------
 
 
-def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> tuple[np.ndarray, float]:
+def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray, where: str = "found") -> tuple[np.ndarray, float]:
     """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; and the area carried, m^2.
 
     The body carries the upper half of the cloth where it lies on skin that faces up. If less than `CARRIED` is carried, the
     highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it. If all that is carried at the
-    top is within `STRAP` of the boundary, it is of narrow straps, which friction alone keeps on shoulders: they are pinned
-    there. distance (V,), away (V, 3): to the body, m, and the unit vectors that lead away from it.
+    top is within `STRAP` of the boundary, it is of straps, which friction alone keeps on shoulders: they are pinned there.
+
+    Args:
+        distance, away: of the vertices (V,) to the body, m, and the unit vectors (V, 3) that lead away from it. where: what to
+            pin: "found", as above, else "shoulders", "top" or "none".
     """
     from scipy.spatial import cKDTree
 
@@ -197,12 +205,13 @@ def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray) -> t
     high = x[:, 1] > np.mean([x[:, 1].min(), x[:, 1].max()])
     lying = (distance < NEAR) & (away[:, 1] > UPWARD) & outer & high
     carried, loops = float(area[lying].sum()), boundary_loops(faces)
-    if not loops:
+    over = np.flatnonzero(lying & (x[:, 1] > x[:, 1].max() - OVER))
+    if where == "none" or not loops:
         return np.zeros(0, np.int32), carried
-    if carried >= CARRIED:
-        over = np.flatnonzero(lying & (x[:, 1] > x[:, 1].max() - OVER))
+    if where == "shoulders" or (where == "found" and carried >= CARRIED):
         far, _ = cKDTree(x[np.concatenate(loops)]).query(x[over])
-        return (over if far.max(initial=0) < STRAP else over[:0]).astype(np.int32), carried
+        narrow = where == "shoulders" or far.max(initial=0) < STRAP
+        return (over if narrow else over[:0]).astype(np.int32), carried
     top = max(loops, key=lambda loop: x[loop, 1].mean())
     near, _ = cKDTree(x[top]).query(x)
     return np.flatnonzero(near <= BAND).astype(np.int32), carried

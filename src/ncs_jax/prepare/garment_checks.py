@@ -13,7 +13,7 @@ from ncs_jax.geometry.mesh import LINE, relative_heights, topology
 from ncs_jax.geometry.triangle_crossings import crossing_pairs
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.surface import boundary_loops
-from ncs_jax.io.records import GarmentRecord
+from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.scene.spec import PhysicsSpec
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "Hole",
     "SurfaceSummary",
     "check_apart",
+    "check_body_size",
     "check_on_body",
     "distance_outside",
     "doubled",
@@ -148,6 +149,23 @@ def _openings(x: np.ndarray, loops: list[np.ndarray]) -> tuple[Hole, ...]:
         small = length < SMALL or (len(loop) <= FEW and length < SHORT * max(lengths))
         found.append(Hole(len(loop), length, float(x[loop, 1].mean()), small))
     return tuple(sorted(found, key=lambda opening: -opening.height))
+
+
+def check_body_size(file: str | Path, body: BodyRecord) -> None:
+    """Raise an InputError unless the body has the size of a character in metres, or about that, of a moving mesh."""
+    height = np.ptp(body.vertices, axis=0).max()
+    if body.frames is not None:
+        if not 0.03 < height < 50:
+            raise InputError(
+                "a body in metres expected, 0.03 to 50 m", file=file, field="vertices", value=f"{height:.3g} m",
+                mend="state its unit: scale = 0.01 below [body] for centimetres, 0.001 for millimetres",
+            )  # fmt: skip
+        return
+    if not 0.3 < height < 5:
+        raise InputError(
+            "a body in metres expected, 0.3 to 5 m tall", file=file, field="vertices", value=f"{height:.3g} m",
+            mend="scale it to metres",
+        )  # fmt: skip
 
 
 def check_on_body(file: Path, garment: GarmentRecord, body: np.ndarray, *, axis_given: bool, scale_given: bool = False) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from ncs_jax import io
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.prepare.constants import model_from
-from ncs_jax.prepare.garment_checks import check_on_body
+from ncs_jax.prepare.garment_checks import check_body_size, check_on_body
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import load_motions
 from ncs_jax.prepare.moving_body import check_character, moving_body
@@ -163,28 +162,11 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
     if body is not None:
         garment = with_body_weights(garment, body)
     if body is not None:
-        _check_body(scene.path(scene.body.file), body)
+        check_body_size(scene.path(scene.body.file), body)
         _check_garment(scene, garment, body)
     pins, layers = _pins(scene, garment), _layers(scene, body, below, dtype)
     mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
     return SceneFiles(scene, body, garment, mesh, pins, layers)
-
-
-def _check_body(file: Path, body: io.BodyRecord) -> None:
-    """Raise an InputError unless the body has the size of a character in metres, or about that, of a moving mesh."""
-    height = np.ptp(body.vertices, axis=0).max()
-    if body.frames is not None:
-        if not 0.03 < height < 50:
-            raise InputError(
-                "a body in metres expected, 0.03 to 50 m", file=file, field="vertices", value=f"{height:.3g} m",
-                mend="state its unit: scale = 0.01 below [body] for centimetres, 0.001 for millimetres",
-            )  # fmt: skip
-        return
-    if not 0.3 < height < 5:
-        raise InputError(
-            "a body in metres expected, 0.3 to 5 m tall", file=file, field="vertices", value=f"{height:.3g} m",
-            mend="scale it to metres",
-        )  # fmt: skip
 
 
 def _check_garment(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
