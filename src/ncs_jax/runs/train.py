@@ -152,6 +152,8 @@ def train_assembly(
 
 def _check_options(steps: int | None, minutes: float | None, resume: bool, start) -> None:
     """Raise an InputError where two options exclude each other."""
+    if steps is not None and not isinstance(steps, int | np.integer):
+        raise InputError("a whole number expected", field="--steps", value=steps, mend="minutes may have fractions, steps not")
     if steps is not None and minutes is not None:
         raise InputError("either steps or minutes expected", field="--minutes", value=minutes, mend="leave one of them out")
     if resume and start is not None:
@@ -278,6 +280,7 @@ class _Loop:
         self._placed, self._output, self._state, self._steps, self._began = placed, output, state, steps, began
         self._every, self._check = whole_chunks(spec.checkpoint_every), whole_chunks(spec.validate_every)
         self._first, self._dropped = int(state.step), int(state.dropped)
+        self._before = self._dropped
         # One look alone may see nothing but frames that stand still: these are all looks since the last validation.
         self._moved: deque[tuple[float, float]] = deque(maxlen=self._check // CHUNK)  # and swung
         self._timed: tuple[int, float] | None = None  # the step and the time after the first chunk, which compiles
@@ -300,6 +303,10 @@ class _Loop:
                 del looks[0]
                 self._steps = int(placed.copied(timed.last(done, time.monotonic() - start, self._steps)))
                 self._output.plan(self._steps)
+        if 2 * (lost := self._dropped - self._before) > self._steps - self._first and jax.process_index() == 0:
+            what = f"{lost} of {self._steps - self._first} steps were dropped, in which something was not finite"
+            last = placed.diagnose(placed.local(self._state))
+            warnings.warn(f"{what}: nothing was learned in them; the last one: {last}", InputWarning, stacklevel=4)
         return Run(placed.assembly, placed.local(self._state.params), self._steps, trained=trained)
 
     def _take(self, at: int, count: int) -> None:
