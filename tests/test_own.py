@@ -17,6 +17,7 @@ from ncs_jax import InputError
 from ncs_jax.cli import main
 from ncs_jax.energies.terms import MEASURED, NAMES, StepInputs, Terms
 from ncs_jax.energies.total import energy_terms
+from ncs_jax.errors import InputWarning
 from ncs_jax.metrics.motion import MEASURES
 from ncs_jax.metrics.quality import QUANTITIES
 from ncs_jax.network.encoders import DynamicEncoder
@@ -134,7 +135,10 @@ def test_a_term_that_breaks_is_named(folder, plain_jax):
         return jnp.sum(jnp.sqrt(x[4] - x[4]))
 
     reports = []
-    ncs_jax.train(scene(folder), None, steps=10, terms=[broken], report=reports.append)
+    with pytest.warns(
+        ncs_jax.InputWarning, match=r"10 of 10 steps were dropped.*nothing was learned.*broken is not finite at vertex 4"
+    ):
+        ncs_jax.train(scene(folder), None, steps=10, terms=[broken], report=reports.append)
     assert reports[-1].dropped == 10 and "broken is not finite at vertex 4" in reports[-1].message
 
 
