@@ -136,7 +136,7 @@ def test_a_term_that_breaks_is_named(folder, plain_jax):
 
     reports = []
     with pytest.warns(
-        ncs_jax.InputWarning, match=r"10 of 10 steps were dropped.*nothing was learned.*broken is not finite at vertex 4"
+        InputWarning, match=r"10 of 10 steps were dropped.*nothing was learned.*broken is not finite at vertex 4"
     ):
         ncs_jax.train(scene(folder), None, steps=10, terms=[broken], report=reports.append)
     assert reports[-1].dropped == 10 and "broken is not finite at vertex 4" in reports[-1].message
