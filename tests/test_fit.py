@@ -263,8 +263,8 @@ def test_straps_that_friction_alone_keeps_on_shoulders_are_pinned_there(width, h
     faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]).astype(np.int32)
     lies = x[:, 1] > 0.999
     away = np.where(lies[:, None], [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    pins, carried = pins_of(io.GarmentRecord(x, faces), np.full(len(x), 0.005), away)
-    assert carried > 0.01
+    pins, carried, straps = pins_of(io.GarmentRecord(x, faces), np.full(len(x), 0.005), away)
+    assert carried > 0.01 and straps == held
     middle = np.flatnonzero(lies & (np.abs(x[:, 0] - 0.3) < 0.14))  # the bends look half aside
     assert lies[pins].all() and (np.isin(middle, pins).all() if held else not len(pins))
     given = io.GarmentRecord(x, faces), np.full(len(x), 0.005), away

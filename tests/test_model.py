@@ -29,10 +29,10 @@ from ncs_jax.geometry.winding_number import winding_number
 from ncs_jax.io import read_body, read_garment
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.packaged import packaged
-from ncs_jax.io.records import BodyRecord, GarmentRecord
+from ncs_jax.io.records import BodyRecord, GarmentRecord, MotionRecord
 from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.prepare.skinning_weights import hung_weights, smooth_weights, transfer_weights, used_joints
-from ncs_jax.prepare.touchable import bare_soles, touchable, touchable_part
+from ncs_jax.prepare.touchable import bare_soles, touchable, touchable_part, turned_away
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.model import local_rotations, pose_body
 from ncs_jax.scene.spec import GarmentSpec, Scene, load_scene
@@ -267,6 +267,37 @@ def test_a_wide_skirt_touches_the_legs_that_it_stands_off():
     near = touchable(body, dress.vertices, blend_from(weights), np.zeros((0, 31, 3)), scene.physics.collision.reach)
     shins = np.flatnonzero((body.vertices[:, 1] > 0.2) & (body.vertices[:, 1] < 0.4))
     assert np.isin(shins, found).all() and not near[shins].any()
+
+
+def test_an_arm_touches_what_it_hangs_beside_by_its_inner_side():
+    """The arms stand off by some 40 degrees at rest; the T-shirt is around the upper ones."""
+    body, dress, shirt = read_body(packaged("body")), read_garment(packaged("dress")), read_garment(packaged("tshirt"))
+    weights = {name: transfer_weights(g.vertices, *_parts(body)) for name, g in (("dress", dress), ("shirt", shirt))}
+    normals, still = vertex_normals(body.vertices, body.faces), np.zeros((0, len(body.parents), 3))
+    away = turned_away(body, dress, blend_from(weights["dress"]), still, 1.0)
+    names = np.array(body.joint_names)[body.weights.argmax(axis=1)]
+    for side, sign in (("Left", 1), ("Right", -1)):
+        arm, aside = names == f"{side}ForeArm", sign * normals[:, 0]
+        assert away[arm & (aside > 0.8)].all() and not away[arm & (aside < -0.8)].any()
+    assert not away[np.isin(names, ["LeftUpLeg", "RightUpLeg", "LowerBack"])].any()  # under the cloth
+
+    inside_out = dataclasses.replace(dress, faces=dress.faces[:, ::-1])
+    np.testing.assert_array_equal(turned_away(body, inside_out, blend_from(weights["dress"]), still, 1.0), away)
+
+    lowered = np.zeros((1, len(body.parents), 3))
+    for name, sign in (("LeftArm", -1), ("RightArm", 1)):
+        lowered[0, body.joint_names.index(name)] = [0, 0, 0.5 * sign]
+    record = MotionRecord(lowered.astype(np.float32), np.zeros((1, 3), np.float32), 30.0)
+    part = touchable_part(Scene(garment=GarmentSpec("ncs:tshirt")), body, shirt, weights["shirt"], [record])
+    kept, arm = np.isin(np.arange(len(names)), part), names == "LeftForeArm"
+    outer, inner = arm & (normals[:, 0] > 0.8), arm & (normals[:, 0] < -0.8)
+    assert kept[inner].all() and kept[outer].mean() < 0.1
+    around = np.flatnonzero((names == "LeftArm") & (body.vertices[:, 0] < shirt.vertices[:, 0].max() - 0.05))
+    assert np.isin(around, part).all()  # a sleeve is touched from all sides
+
+
+def _parts(body):
+    return body.vertices, body.faces, body.weights
 
 
 def test_the_host_corrects_a_pose_as_the_model_does(rng):

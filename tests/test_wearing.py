@@ -44,6 +44,9 @@ def test_a_garment_that_the_body_does_not_wear_is_told():
     assert aside[0] == "openings of the garment" and "none of its 4" in aside[1]
     through, *rest = wearing_faults(replace(shirt, vertices=shirt.vertices + [0.15, 0, 0]), body)
     assert through[0] == "bones through the cloth at rest" and "Spine1" in through[1] and not rest
+    child = replace(body, vertices=body.vertices * 0.7, joints=body.joints * 0.7)
+    (large,) = wearing_faults(io.read_garment("ncs:dress"), child)
+    assert large[0] == "openings of the garment" and "far too large for this body" in large[2]
 
 
 def test_cloth_with_one_opening_beside_the_body_is_no_fault():

@@ -228,7 +228,7 @@ def _say_what(found, given, pins: str) -> None:
     """Print what was done to the garment at its place, and what it is made of."""
     import numpy as np
 
-    from ncs_jax.prepare.fit import CARRIED, PINS
+    from ncs_jax.prepare.fit import PINS
     from ncs_jax.prepare.garment_checks import summarise_surface
 
     g, (before, after) = found.garment, found.depth
@@ -250,8 +250,7 @@ def _say_what(found, given, pins: str) -> None:
     if PINS in given.groups and pins == "found":
         print(f"  pins      {len(g.groups[PINS])} vertices, the file's own")
     elif PINS in g.groups:
-        straps = pins == "shoulders" or (pins == "found" and found.carried >= CARRIED)
-        told = "over the shoulders, where nothing but friction keeps them" if straps else "around its highest opening"
+        told = "over the shoulders, where nothing but friction keeps them" if found.straps else "around its highest opening"
         print(f"  pins      {len(g.groups[PINS])} vertices {told}")
     else:
         told = "as is said" if pins == "none" else f"{1e4 * found.carried:.0f} cm^2 lie on skin that faces up"

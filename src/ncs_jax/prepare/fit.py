@@ -21,7 +21,7 @@ from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.scene.spec import CollisionSpec
 
-__all__ = ["CARRIED", "PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
+__all__ = ["PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
 TRIES = 12  # of bringing cloth apart
@@ -41,14 +41,15 @@ class Fitted:
 
     garment: in metres and Y up and, where nothing carries it, with the group `pins`. placement: where it was found to
     belong, before it was pushed out. depth: of every vertex inside the body, before and after the push, m, negative outside.
-    carried: its area that lies on what faces up, m^2. contact: the thickness and stiffness of a collision that keep the skin
-    from showing through.
+    carried: its area that lies on what faces up, m^2. straps: whether these are what is pinned. contact: the thickness and
+    stiffness of a collision that keep the skin from showing through.
     """
 
     garment: GarmentRecord
     placement: Placement
     depth: tuple[np.ndarray, np.ndarray]
     carried: float
+    straps: bool
     contact: Cover
 
 
@@ -101,13 +102,13 @@ def settle(
     placed = replace(placed, vertices=x.astype(placed.vertices.dtype))
     check_apart(file, placed)
     away = _away_from(body, placed.vertices)
-    held, carried = pins_of(placed, *away, pins)
+    held, carried, straps = pins_of(placed, *away, pins)
     own = pins == "found" and PINS in placed.groups
     groups = (
         placed.groups if own else {n: g for n, g in placed.groups.items() if n != PINS} | ({PINS: held} if len(held) else {})
     )
     depth = -_away_from(body, before)[0], -away[0]
-    return Fitted(replace(placed, groups=groups), placement, depth, carried, contact)
+    return Fitted(replace(placed, groups=groups), placement, depth, carried, straps and not own, contact)
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
@@ -184,8 +185,11 @@ def bring_apart(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: f
 # --- pins -----------------------------------------------------------------------------------------------------------
 
 
-def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray, where: str = "found") -> tuple[np.ndarray, float]:
-    """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; and the area carried, m^2.
+def pins_of(
+    garment: GarmentRecord, distance: np.ndarray, away: np.ndarray, where: str = "found"
+) -> tuple[np.ndarray, float, bool]:
+    """Return the vertices to pin so that a garment does not slide down, none if shoulders carry it; the area carried, m^2; and
+    whether they are straps'.
 
     The body carries the upper half of the cloth where it lies on skin that faces up. If less than `CARRIED` is carried, the
     highest loop of the boundary is a waistband: it is pinned, and so is all within `BAND` of it. If all that is carried at the
@@ -207,11 +211,11 @@ def pins_of(garment: GarmentRecord, distance: np.ndarray, away: np.ndarray, wher
     carried, loops = float(area[lying].sum()), boundary_loops(faces)
     over = np.flatnonzero(lying & (x[:, 1] > x[:, 1].max() - OVER))
     if where == "none" or not loops:
-        return np.zeros(0, np.int32), carried
+        return np.zeros(0, np.int32), carried, False
     if where == "shoulders" or (where == "found" and carried >= CARRIED):
         far, _ = cKDTree(x[np.concatenate(loops)]).query(x[over])
         narrow = where == "shoulders" or far.max(initial=0) < STRAP
-        return (over if narrow else over[:0]).astype(np.int32), carried
+        return (over if narrow else over[:0]).astype(np.int32), carried, narrow
     top = max(loops, key=lambda loop: x[loop, 1].mean())
     near, _ = cKDTree(x[top]).query(x)
-    return np.flatnonzero(near <= BAND).astype(np.int32), carried
+    return np.flatnonzero(near <= BAND).astype(np.int32), carried, False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import numpy as np
 
@@ -16,7 +18,16 @@ from ncs_jax.prepare.posing import carried, corrected_rest, joint_transforms
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest, resting_body
 
-__all__ = ["bare_soles", "covered_by_layers", "submesh", "surface_of", "touchable", "touchable_faces", "touchable_part"]
+__all__ = [
+    "bare_soles",
+    "covered_by_layers",
+    "submesh",
+    "surface_of",
+    "touchable",
+    "touchable_faces",
+    "touchable_part",
+    "turned_away",
+]
 
 FRAMES = 60  # poses that are looked at, at most
 
@@ -29,19 +40,53 @@ def touchable(body: io.BodyRecord, garment: np.ndarray, garment_blend: Blend, po
     from scipy.spatial import cKDTree
 
     near = np.zeros(len(body.vertices), bool)
+    for cloth, skin in _posed(body, garment, garment_blend, poses):
+        near |= np.isfinite(cKDTree(cloth).query(skin, distance_upper_bound=reach)[0])
+    return near
+
+
+def _posed(body, garment: np.ndarray, garment_blend: Blend, poses: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield garment and skin (V, 3), m, at rest and in the poses; of a moving mesh in frames of its own."""
     if body.frames is not None and body.carriers is not None:
         for k in np.unique(np.linspace(0, len(body.frames) - 1, min(len(body.frames), FRAMES)).astype(int)):
-            cloth = carried(garment, garment_blend, body.carriers[k])
-            near |= np.isfinite(cKDTree(cloth).query(body.frames[k], distance_upper_bound=reach)[0])
-        return near
+            yield carried(garment, garment_blend, body.carriers[k]), body.frames[k]
+        return
     body_blend = blend_from(body.weights)
     more = None if body.posedirs is None else correctives_from(body.posedirs)
     for transforms in joint_transforms(body, np.concatenate([np.zeros((1, len(body.parents), 3)), poses])):
-        cloth = carried(garment, garment_blend, transforms)
         skin = carried(corrected_rest(body.vertices, more, transforms, body.parents), body_blend, transforms)
-        distance, _ = cKDTree(cloth).query(skin, distance_upper_bound=reach)
-        near |= np.isfinite(distance)
-    return near
+        yield carried(garment, garment_blend, transforms), skin
+
+
+THROUGH, AWAY = 0.02, -0.2  # m; and cosine of skin's normal with the way to the nearest cloth
+
+
+def turned_away(
+    body: io.BodyRecord, garment: io.GarmentRecord, garment_blend: Blend, poses: np.ndarray, reach: float
+) -> np.ndarray:
+    """Return which body vertices (body,) turn their back on the garment on average over the poses in which they are near it.
+
+    An arm touches a garment of the trunk by its inner side. If cloth touched the outer side too, an arm that presses into the
+    garment would push half of it out around itself, and never get free. Only skin that is outside of the garment tells, since
+    what it surrounds may touch it from all sides.
+
+    poses, reach: see `touchable`.
+    """
+    from scipy.spatial import cKDTree
+
+    facing, seen = np.zeros(len(body.vertices)), np.zeros(len(body.vertices))
+    _, nearest = cKDTree(body.vertices).query(garment.vertices)
+    outward = vertex_normals(garment.vertices, garment.faces)
+    side = np.sign(np.sum((garment.vertices - body.vertices[nearest]) * outward)) or 1.0
+    for cloth, skin in _posed(body, garment.vertices, garment_blend, poses):
+        distance, near = cKDTree(cloth).query(skin, distance_upper_bound=reach)
+        some = np.flatnonzero(np.isfinite(distance) & (distance > THROUGH))
+        way = cloth[near[some]] - skin[some]
+        outside = np.sum(way * vertex_normals(cloth, garment.faces)[near[some]], axis=1) * side < 0
+        cosine = np.sum(way * vertex_normals(skin, body.faces)[some], axis=1) / distance[some]
+        facing[some[outside]] += cosine[outside]
+        seen[some[outside]] += 1
+    return facing < AWAY * seen
 
 
 SOLE, DOWN = 0.03, 0.5  # of the body's height; and cosine of a normal with what is down
@@ -107,8 +152,8 @@ def _worn(model: Model, matrices) -> tuple[jax.Array, jax.Array]:
 def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     """Return the numbers of the body vertices that the garment can touch in the scene's motions.
 
-    They come near it as the body alone carries it (`touchable`), or it surrounds them at rest (`enclosure`): a wide skirt
-    stands off from the legs until it hangs. `bare_soles` are not among them.
+    They come near it as the body alone carries it (`touchable`) and face it (`turned_away`), or it surrounds them at rest
+    (`enclosure`): a wide skirt stands off from the legs until it hangs. `bare_soles` are not among them.
     """
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
@@ -118,10 +163,11 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     corners = body.vertices[body.faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
     reach = scene.physics.collision.reach + edge / np.sqrt(3)
-    near = touchable(body, garment.vertices, blend_from(weights), some, reach)
-    far = np.flatnonzero(~near)
-    near[far] = enclosure(body.vertices[far], garment.vertices, garment.faces) > ENCLOSED
-    return np.setdiff1d(body.faces[near[body.faces].any(axis=1)], np.flatnonzero(bare_soles(body, garment.vertices)))
+    blend = blend_from(weights)
+    near = touchable(body, garment.vertices, blend, some, reach)
+    within = enclosure(body.vertices, garment.vertices, garment.faces) > ENCLOSED
+    untouched = bare_soles(body, garment.vertices) | turned_away(body, garment, blend, some, reach + edge) & ~within
+    return np.setdiff1d(body.faces[(near | within)[body.faces].any(axis=1)], np.flatnonzero(untouched))
 
 
 def bare_soles(body: io.BodyRecord, garment: np.ndarray) -> np.ndarray:

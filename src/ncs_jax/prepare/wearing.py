@@ -21,6 +21,7 @@ PLACES = 1 / 32  # of the body's height: distance of the places at which a garme
 CELL = 1 / 40  # of the body's height: side of a cell of the grid
 FAR = 1 / 8  # of the body's height: cloth that is farther from the skin is told to be infinitely far
 NAMED = 6  # joints that a fault names
+WORN = 0.99  # of the length of its openings has the body in it
 SMALL = 1 / 12  # of the body's height: an opening that is shorter is a buttonhole
 OFF = np.array([1.3e-4, 0.7e-4, 2.1e-4])  # m; a bone must not run along the symmetric edges of a mesh
 
@@ -193,15 +194,21 @@ def _even(x: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.
 
 def wearing_faults(garment: GarmentRecord, body: BodyRecord) -> Iterator[tuple[str, str, str, str]]:
     """Yield why a body at rest does not wear a garment, each as what, its value, what follows, and the mend: bones that pass
-    through its cloth, and openings of which none has the body in it."""
+    through its cloth, and openings that do not have the body in them."""
     skin, x = skin_of(body), garment.vertices.astype(np.float64)
     names, mend = body_names(body), "ncs fit finds its unit, axes and place"
     if bones := pierced(x, garment.faces, skin):
         value = ", ".join(names[j] if names else f"joint {j}" for j in bones[:NAMED])
         more = f" and {len(bones) - NAMED} more" if len(bones) > NAMED else ""
         yield "bones through the cloth at rest", value + more, "contact can push it off on no side", mend
+        return
     loops = [x[loop] for loop in boundary_loops(garment.faces)]
     large = len(large_loops(loops, skin))
-    if large > 1 and len(skin.bones) and not threaded(loops, skin):
+    if large < 2 or not len(skin.bones) or (share := threaded(loops, skin)) > WORN:
+        return
+    if not share:
         value = f"none of its {large} has the body in it at rest"
         yield "openings of the garment", value, "it is beside the body, or across it, and not worn", mend
+    else:
+        value = f"the body passes through {100 * share:.0f} % of their length at rest, not through all"
+        yield "openings of the garment", value, "it is far too large for this body, or not where it is worn", mend
