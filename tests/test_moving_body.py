@@ -18,6 +18,7 @@ from ncs_jax.prepare.regions import find_regions
 from ncs_jax.prepare.scene_checks import find_risks
 from ncs_jax.prepare.setting import set_up
 from ncs_jax.scene.model import pose_body
+from ncs_jax.simulation.walk_in import walk_in
 from ncs_jax.view.character import animation_of, body_vertices
 
 from .scenes import SCENE, grid, post, write_scene
@@ -208,6 +209,12 @@ def test_contact_keeps_to_the_vertices_of_the_file(walk, tmp_path):
         np.testing.assert_array_equal(pose_body(made.model, made.track.matrices[t]), walk[0][t, part].astype(np.float64))
     drawn = animation_of(made, None, np.zeros((24, 30, 3)))
     np.testing.assert_array_equal(drawn.body.vertices, walk[0])
+
+
+def test_a_garment_begins_on_the_first_frame(walk, tmp_path):
+    """A moving mesh has no joints to turn from rest: its rest is its first frame."""
+    made = assemble(load_scene(write_moving(tmp_path, walk)))
+    assert walk_in(made.model, made.track.matrices[0]).shape == (0, *made.track.matrices.shape[1:])
 
 
 def test_frames_are_chosen_and_resampled_to_the_scene(walk, tmp_path):
