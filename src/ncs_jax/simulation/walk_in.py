@@ -23,8 +23,8 @@ def walk_in(model: Model, matrices: Float[Array, "joints 3 4"]) -> Float[Array, 
     the packaged dress at 1.83 J. Cloth that follows the arm falls in folds: 1.78 J, as it does over a second of motion.
 
     The root stays where the pose has it. Every other joint turns from its rest evenly, about one axis, relative to its parent;
-    no pose is `ANGLE` from the next one. There are none where nothing turns, none on a moving mesh, whose rest is its first frame,
-    and none over other garments: where these are in such poses is not known.
+    no pose is `ANGLE` from the next one. There are none where nothing turns; none on a moving mesh, whose rest is its first
+    frame; and none over other garments: where these are in such poses is not known.
     """
     from scipy.spatial.transform import Rotation
 
