@@ -253,9 +253,13 @@ def test_enclosure_is_the_winding_number_away_from_the_cloth(rng):
     faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (b, d, c))])
     x = rng.uniform(-1, 1, (400, 3))
     x = x[cKDTree(cone).query(x)[0] > 0.15]
-    right = np.abs(winding_number(x, cone[faces]))
-    assert right.max() > 0.7 and right.min() < 0.02  # from within to outside
-    np.testing.assert_allclose(enclosure(x, cone, faces), right, atol=0.01)
+    right = winding_number(x, cone[faces])
+    right *= np.sign(right[np.abs(right).argmax()])
+    assert right.max() > 0.7 and right.min() < -0.02  # from within to beside
+    for turned in (faces, faces[:, ::-1]):
+        np.testing.assert_allclose(enclosure(x, cone, turned), right, atol=0.01)
+    below, aside = enclosure(np.array([[0, -1.2, 0], [0.8, -0.3, 0]]), cone, faces)
+    assert 0 < below < 0.5 and aside < 0
 
 
 def test_a_wide_skirt_touches_the_legs_that_it_stands_off():
@@ -289,9 +293,9 @@ def test_an_arm_touches_what_it_hangs_beside_by_its_inner_side():
         lowered[0, body.joint_names.index(name)] = [0, 0, 0.5 * sign]
     record = MotionRecord(lowered.astype(np.float32), np.zeros((1, 3), np.float32), 30.0)
     part = touchable_part(Scene(garment=GarmentSpec("ncs:tshirt")), body, shirt, weights["shirt"], [record])
-    kept, arm = np.isin(np.arange(len(names)), part), names == "LeftForeArm"
+    kept, arm = np.isin(np.arange(len(names)), part), (names == "LeftForeArm") & (body.vertices[:, 1] < 1.04)
     outer, inner = arm & (normals[:, 0] > 0.8), arm & (normals[:, 0] < -0.8)
-    assert kept[inner].all() and kept[outer].mean() < 0.1
+    assert kept[inner].all() and kept[outer].mean() < 0.15  # some where the cloth ends
     around = np.flatnonzero((names == "LeftArm") & (body.vertices[:, 0] < shirt.vertices[:, 0].max() - 0.05))
     assert np.isin(around, part).all()  # a sleeve is touched from all sides
 

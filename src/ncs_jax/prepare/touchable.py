@@ -10,7 +10,7 @@ import numpy as np
 from ncs_jax import io
 from ncs_jax.energies.contact.points import contact_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
-from ncs_jax.geometry.enclosure import ENCLOSED, enclosure
+from ncs_jax.geometry.enclosure import ENCLOSED, enclosure, facing
 from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
@@ -74,19 +74,17 @@ def turned_away(
     """
     from scipy.spatial import cKDTree
 
-    facing, seen = np.zeros(len(body.vertices)), np.zeros(len(body.vertices))
-    _, nearest = cKDTree(body.vertices).query(garment.vertices)
-    outward = vertex_normals(garment.vertices, garment.faces)
-    side = np.sign(np.sum((garment.vertices - body.vertices[nearest]) * outward)) or 1.0
+    faced, seen = np.zeros(len(body.vertices)), np.zeros(len(body.vertices))
+    side = facing(garment.vertices, garment.faces)
     for cloth, skin in _posed(body, garment.vertices, garment_blend, poses):
         distance, near = cKDTree(cloth).query(skin, distance_upper_bound=reach)
         some = np.flatnonzero(np.isfinite(distance) & (distance > THROUGH))
         way = cloth[near[some]] - skin[some]
         outside = np.sum(way * vertex_normals(cloth, garment.faces)[near[some]], axis=1) * side < 0
         cosine = np.sum(way * vertex_normals(skin, body.faces)[some], axis=1) / distance[some]
-        facing[some[outside]] += cosine[outside]
+        faced[some[outside]] += cosine[outside]
         seen[some[outside]] += 1
-    return facing < AWAY * seen
+    return faced < AWAY * seen
 
 
 SOLE, DOWN = 0.03, 0.5  # of the body's height; and cosine of a normal with what is down
@@ -152,8 +150,9 @@ def _worn(model: Model, matrices) -> tuple[jax.Array, jax.Array]:
 def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     """Return the numbers of the body vertices that the garment can touch in the scene's motions.
 
-    They come near it as the body alone carries it (`touchable`) and face it (`turned_away`), or it surrounds them at rest
-    (`enclosure`): a wide skirt stands off from the legs until it hangs. `bare_soles` are not among them.
+    They come near it as the body alone carries it (`touchable`), or it surrounds them at rest (`enclosure`): a wide skirt
+    stands off from the legs until it hangs. Of what is beside it at rest, not in or before an opening as a shin below a hem is,
+    only what faces it is among them (`turned_away`); `bare_soles` are not.
     """
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
@@ -165,9 +164,10 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     reach = scene.physics.collision.reach + edge / np.sqrt(3)
     blend = blend_from(weights)
     near = touchable(body, garment.vertices, blend, some, reach)
-    within = enclosure(body.vertices, garment.vertices, garment.faces) > ENCLOSED
-    untouched = bare_soles(body, garment.vertices) | turned_away(body, garment, blend, some, reach + edge) & ~within
-    return np.setdiff1d(body.faces[(near | within)[body.faces].any(axis=1)], np.flatnonzero(untouched))
+    within = enclosure(body.vertices, garment.vertices, garment.faces)
+    beside = (within < 0) & turned_away(body, garment, blend, some, reach + edge)
+    untouched = np.flatnonzero(bare_soles(body, garment.vertices) | beside)
+    return np.setdiff1d(body.faces[(near | (within > ENCLOSED))[body.faces].any(axis=1)], untouched)
 
 
 def bare_soles(body: io.BodyRecord, garment: np.ndarray) -> np.ndarray:
