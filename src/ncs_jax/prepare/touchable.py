@@ -64,11 +64,11 @@ THROUGH, AWAY = 0.02, -0.2  # m; and cosine of skin's normal with the way to the
 def turned_away(
     body: io.BodyRecord, garment: io.GarmentRecord, garment_blend: Blend, poses: np.ndarray, reach: float
 ) -> np.ndarray:
-    """Return which body vertices (body,) turn their back on the garment on average over the poses in which they are near it.
+    """Return which body vertices (body,) are beside the garment and turn their back on it, over the poses in which it is near.
 
     An arm touches a garment of the trunk by its inner side. If cloth touched the outer side too, an arm that presses into the
-    garment would push half of it out around itself, and never get free. Only skin that is outside of the garment tells, since
-    what it surrounds may touch it from all sides.
+    garment would push half of it out around itself, and never get free. What is in the garment at rest, or before an opening as
+    a shin below a hem is, may be touched from all sides: there `enclosure` is not negative.
 
     poses, reach: see `touchable`.
     """
@@ -84,7 +84,10 @@ def turned_away(
         cosine = np.sum(way * vertex_normals(skin, body.faces)[some], axis=1) / distance[some]
         faced[some[outside]] += cosine[outside]
         seen[some[outside]] += 1
-    return faced < AWAY * seen
+    away = np.flatnonzero(faced < AWAY * seen)
+    found = np.zeros(len(body.vertices), bool)
+    found[away] = enclosure(body.vertices[away], garment.vertices, garment.faces) < 0
+    return found
 
 
 SOLE, DOWN = 0.03, 0.5  # of the body's height; and cosine of a normal with what is down
@@ -151,8 +154,7 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     """Return the numbers of the body vertices that the garment can touch in the scene's motions.
 
     They come near it as the body alone carries it (`touchable`), or it surrounds them at rest (`enclosure`): a wide skirt
-    stands off from the legs until it hangs. Of what is beside it at rest, not in or before an opening as a shin below a hem is,
-    only what faces it is among them (`turned_away`); `bare_soles` are not.
+    stands off from the legs until it hangs. `bare_soles` are not among them, nor what is `turned_away`.
     """
     if scene.body.part == "all":
         return np.arange(len(body.vertices))
@@ -164,10 +166,10 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     reach = scene.physics.collision.reach + edge / np.sqrt(3)
     blend = blend_from(weights)
     near = touchable(body, garment.vertices, blend, some, reach)
-    within = enclosure(body.vertices, garment.vertices, garment.faces)
-    beside = (within < 0) & turned_away(body, garment, blend, some, reach + edge)
-    untouched = np.flatnonzero(bare_soles(body, garment.vertices) | beside)
-    return np.setdiff1d(body.faces[(near | (within > ENCLOSED))[body.faces].any(axis=1)], untouched)
+    far = np.flatnonzero(~near)
+    near[far] = enclosure(body.vertices[far], garment.vertices, garment.faces) > ENCLOSED
+    untouched = bare_soles(body, garment.vertices) | turned_away(body, garment, blend, some, reach + edge)
+    return np.setdiff1d(body.faces[near[body.faces].any(axis=1)], np.flatnonzero(untouched))
 
 
 def bare_soles(body: io.BodyRecord, garment: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from ncs_jax.geometry.skinning import blend_from
 from ncs_jax.io import MotionRecord
 from ncs_jax.metrics.quality import summarise
 from ncs_jax.prepare.build import Assembly, TrainingMotions, training_features
-from ncs_jax.prepare.touchable import covered_by_layers, touchable, touchable_part
+from ncs_jax.prepare.touchable import covered_by_layers, touchable, touchable_part, turned_away
 from ncs_jax.runs.begin import unread_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_run, read_trained, write_run
 from ncs_jax.runs.log import Report
@@ -254,7 +254,9 @@ def _part(a: Assembly, records: Sequence[MotionRecord]) -> np.ndarray:
         return part
     poses = np.concatenate([r.poses for r in records])
     some = poses[np.unique(np.linspace(0, len(poses) - 1, SEEN).astype(int))]
-    near = np.flatnonzero(touchable(body, a.garment.vertices, blend_from(a.prepared.weights), some, NEAR))
+    blend = blend_from(a.prepared.weights)
+    near = touchable(body, a.garment.vertices, blend, some, NEAR)
+    near = np.flatnonzero(near & ~turned_away(body, a.garment, blend, some, a.scene.physics.collision.reach))
     if a.model.under:
         near = near[~covered_by_layers(body, a.model.under)[near]]
     if not np.setdiff1d(near, part).size:
