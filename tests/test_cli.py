@@ -540,6 +540,8 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
     monkeypatch.setattr("ncs_jax.view.preview.MEASURED", 8)
     out = tmp_path / "drawn"
+    assert main(["preview", str(folder), "--out", f"{out}.png"]) == 2 and not Path(f"{out}.png").exists()
+    assert "a folder expected" in capsys.readouterr().err
     assert main(["preview", str(folder), "--motion", str(tmp_path / "other.npz"), "--out", str(out)]) == 0
     text = capsys.readouterr().out
     written = [Path(line.strip()).name for line in text.splitlines() if line.startswith(f"  {out}")]

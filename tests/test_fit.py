@@ -172,6 +172,23 @@ def test_a_shirt_of_another_origin_unit_and_axes_comes_home(scale, up, offset):
     assert np.linalg.norm(found.garment.vertices - shirt.vertices, axis=1).mean() < 0.01
 
 
+@pytest.mark.parametrize("aside", [-0.3, 0.21])
+def test_a_loose_garment_alike_left_and_right_comes_into_the_middle(aside):
+    """Cloth that hangs free tells nothing of the place sideways: it came to lie 4 mm off, and other dresses 2 cm."""
+    body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
+    middle = shirt.vertices.mean(axis=0)
+    wide = ((shirt.vertices - middle) * [1.06, 1, 1.06] + middle).astype(np.float32)
+    found = place("g.obj", replace(shirt, vertices=wide + np.array([aside, 0, 0.1], np.float32)), body)
+    assert not found.doubt and np.abs(found.garment.vertices - wide)[:, 0].max() < 0.0015
+
+
+def test_the_body_is_no_garment(tmp_path, capsys):
+    assert main(["body", "--out", str(tmp_path / "body.obj")]) == 0
+    out = tmp_path / "fitted.npz"
+    assert main(["fit", str(tmp_path / "body.obj"), "--body", "ncs:body", "--out", str(out)]) == 2
+    assert "this is the body itself" in capsys.readouterr().err and not out.exists()
+
+
 def test_left_handed_axes_are_told_by_faces_that_look_inward():
     body, shirt = io.read_body(ASSETS / "body.npz"), io.read_garment(ASSETS / "tshirt.npz")
     found = place("g.obj", replace(shirt, vertices=(shirt.vertices + [0.1, 0.2, 0.1]) * [-1, 1, 1]), body)

@@ -282,6 +282,8 @@ def test_minutes_that_were_measured_wrongly_are_planned_anew(tmp_path, plain_jax
 def test_steps_are_whole(tmp_path):
     with pytest.raises(InputError, match=r"steps: a whole number expected .*60\.0"):
         train(write_scene(tmp_path, FREE), None, steps=60.0)
+    with pytest.raises(InputError, match=r"steps: at least one step expected .*0"):
+        train(write_scene(tmp_path, FREE), None, steps=0)
 
 
 def test_resumed_to_more_steps_a_run_goes_on_to_them(tmp_path, plain_jax):

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ncs_jax import io
 from ncs_jax.cli import main
 from ncs_jax.io import MotionRecord
 from ncs_jax.prepare import scene_checks
 from ncs_jax.prepare.scene_checks import RANGES, find_risks
+from ncs_jax.prepare.setting import set_up
 from ncs_jax.prepare.speed_checks import FLUNG, flung, frames_named, good_stretches, thrown
 from ncs_jax.runs.run import assemble
 from ncs_jax.scene.spec import load_scene
@@ -45,6 +47,15 @@ def test_the_packaged_scenes_are_safe(name, plain_jax, capsys, tmp_path):
 
 def test_a_sound_scene_is_safe(tmp_path, plain_jax):
     assert found(tmp_path) == []
+
+
+def test_a_garment_beside_the_body_is_told(tmp_path, plain_jax):
+    """It touches nothing, and so there is nothing else to check of its contact."""
+    shirt = io.read_garment("ncs:tshirt")
+    io.write_garment(tmp_path / "g.npz", replace(shirt, vertices=shirt.vertices + np.float32([0.9, 0, 0])))
+    (tmp_path / "s.toml").write_text('[garment]\nfile = "g.npz"\n[motion]\nfiles = ["ncs:stand"]\n')
+    told = {risk.what: risk for risk in find_risks(set_up(load_scene(tmp_path / "s.toml")))}
+    assert "none of its 4 has the body in it" in told["openings of the garment"].value
 
 
 PHYSICS = {

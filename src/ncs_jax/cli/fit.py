@@ -151,6 +151,11 @@ def _placed(options, body, scale: float):
             Scene().path(options.garment), scale=scale, up=options.up.removeprefix("-"), weld=options.weld, mesh=options.mesh,
             turn_faces=True,
         )  # fmt: skip
+    if len(given.faces) == len(body.faces):
+        raise InputError(
+            "a garment expected", file=options.garment, value=f"{len(given.faces)} triangles, as many as the body has",
+            mend="this is the body itself; name the garment's file, or the garment in it with --mesh",
+        )  # fmt: skip
     given = with_body_weights(given, body)
     move = (0.0, 0.0, 0.0) if options.stay else options.move
     known = {"scale": scale or None, "up": options.up or None, "turn": options.turn}

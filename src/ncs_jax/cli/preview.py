@@ -7,8 +7,11 @@ from pathlib import Path
 
 from ncs_jax.cli import arguments
 from ncs_jax.cli.progress import WorkProgress
+from ncs_jax.errors import InputError
 
 __all__ = ["add_commands", "check_video", "draw", "preview"]
+
+DRAWN = (".png", ".html", ".gif", ".mp4", ".jpg")
 
 
 def add_commands(commands) -> None:
@@ -24,6 +27,10 @@ def preview(options) -> int:
     """Draw a run, and print how it does on the motion."""
     arguments.check_run(options.folder)
     out = options.out or options.folder
+    if Path(out).suffix.lower() in DRAWN:
+        raise InputError(
+            "a folder expected", field="--out", value=out, mend="its files are preview.png, preview.html and others"
+        )
     if options.video:
         check_video(out)
     from ncs_jax.runs.checkpoint import check_writable

@@ -16,7 +16,7 @@ from ncs_jax.prepare.hanging import CENTRED, SHAPED, Trunk, opening_on, trunk_of
 from ncs_jax.prepare.placement import Placement, of_no_size
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.straps import lift_to_rest
-from ncs_jax.prepare.wearing import Cloth, Skin, cloth_of, large_loops, pierced, skin_of, threaded
+from ncs_jax.prepare.wearing import Cloth, Skin, beside_middle, cloth_of, large_loops, pierced, skin_of, threaded
 
 __all__ = ["AXES", "TURNED", "place"]
 
@@ -54,7 +54,8 @@ UPSIDE = 0.002, 0.0005  # of the height: what a place upside down, and one turne
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """One unit and orientation (own: the file's; told: its user gave the unit) and a place: points @ turned * scale + shift."""
+    """One unit and orientation (own: the file's; told: its user gave the unit) and a place: points @ turned * scale + shift;
+    whether it is `_centred`."""
 
     scale: float
     up: str
@@ -65,6 +66,7 @@ class _Way:
     told: bool
     shift: np.ndarray
     cost: float = np.inf
+    centred: bool = False
 
     def points(self, x: np.ndarray) -> np.ndarray:
         return x @ self.turned * self.scale + self.shift
@@ -110,14 +112,15 @@ def place(
     near = [float(_misfit(*e, skin, press=ROUGH[1])) for e in exact]  # even if somewhat inside
     first = sorted(range(len(here)), key=lambda i: (not here[i].own, -_value(replace(here[i], cost=near[i]), fine, skin)))
     here = [replace(here[i], cost=float(_misfit(*exact[i], skin))) for i in first[:FINE]]
-    found = here if move is not None else [*_search(ways, cloth_of(raw, 100), fine, skin), *here]
+    searched = [] if move is not None else _search(ways, cloth_of(raw, 100), fine, skin)
+    found = [*(_centred(w, raw, fine, skin) for w in searched), *here]
     seen = [(w, _look(w, raw, fine, skin, body)) for w in found]
     ranked = _ranked(seen, fine, skin)
     best = ranked[0][0]
     if move is None and best.prior < 1:  # the best place unturned too: most garments are alike from front and back
         plain = [w for w in ways if w.scale == best.scale and w.up == best.up[-1] and not w.turn]
         plain = [_moved(replace(w, shift=best.points(fine.middle) - w.points(fine.middle)), fine, skin) for w in plain]
-        seen += [(w, _look(w, raw, fine, skin, body)) for w in plain]
+        seen += [(w, _look(w, raw, fine, skin, body)) for w in (_centred(w, raw, fine, skin) for w in plain)]
         ranked = _ranked(seen, fine, skin)
     if move is not None:
         return _given(ranked, fine, skin, (scale is not None, up is not None))
@@ -132,12 +135,10 @@ def place(
 def _ways(garment, raw, skin: Skin, mirrored: bool, given) -> Iterator[_Way]:
     """Yield every unit and orientation in which the garment may be worn."""
     scale, up, turn = given
-    size = np.ptp(raw.vertices, axis=0).max() / skin.height
+    size, (least, most) = np.ptp(raw.vertices, axis=0).max() / skin.height, SIZES
     for unit in (scale,) if scale else dict.fromkeys((garment.scale, *UNITS)):
         own = unit == garment.scale
-        if (not (own or scale) and not SIZES[0] <= size * unit <= SIZES[1]) or not SIZES[0] / 3 <= size * unit <= 1.5 * SIZES[
-            1
-        ]:
+        if not least / 3 <= size * unit <= 1.5 * most or not (own or scale or least <= size * unit <= most):
             continue
         for axis in (up,) if up else AXES:
             for angle in TURNED if turn is None else (turn,):
@@ -209,6 +210,16 @@ def _moved(way: _Way, cloth: Cloth, skin: Skin, most: int = 100) -> _Way:
         options={"xatol": 1e-3, "fatol": 1e-6, "maxiter": most, "initial_simplex": simplex},
     )  # fmt: skip
     return replace(way, shift=best.x, cost=float(best.fun))
+
+
+def _centred(way: _Way, raw: GarmentRecord, cloth: Cloth, skin: Skin) -> _Way:
+    """Return a way with the garment's middle in the body's, if both are alike left and right and it lies as well there."""
+    aside = beside_middle(way.points(raw.vertices.astype(np.float64)), raw.faces, skin)
+    if aside is None or abs(aside) > AWAY * skin.height:
+        return way
+    shift = way.shift - [aside, 0, 0]
+    cost = _cost(way.points(cloth.points) - [aside, 0, 0], cloth.normals @ way.turned, skin)
+    return replace(way, shift=shift, cost=cost, centred=True) if cost < FLAT * way.cost else way
 
 
 def _cost(x: np.ndarray, normals: np.ndarray, skin: Skin) -> float:
@@ -373,7 +384,7 @@ def _uncertain(way: _Way, cloth: Cloth, skin: Skin) -> tuple[str, str]:
         return cost / way.cost, (cost - way.cost) / max(worst - way.cost, 1e-9 * worst)
 
     for k, words in ((1, "up or down"), (0, "sideways"), (2, "back or forth")):
-        for sign in (1, -1):
+        for sign in () if k == 0 and way.centred else (1, -1):
             ratio, less = lost(sign * np.eye(3)[k])
             if ratio >= FLAT:
                 continue

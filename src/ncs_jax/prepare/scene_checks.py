@@ -335,9 +335,10 @@ def _looked_for(a: Setting, say: Callable[[str], None]) -> list[Risk]:
     """Return what `find_risks` does, without having kept anything."""
     found = motion_risks(a, say)
     body, faces = a.body, None
+    if body is not None:
+        found += [Risk(*fault) for fault in wearing_faults(a.garment, body)]
     if a.model.body is not None and body is not None:
         faces = touchable_faces(a.model, body, a.prepared.part)
-        found += [Risk(*fault) for fault in wearing_faults(a.garment, body)]
         found += [*_shows(a, faces), *_folds(a)]
     found += [*_material(a.scene), *_grain(a), *_mesh(a)]
     if faces is not None and body is not None:

@@ -13,7 +13,7 @@ from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.records import BodyRecord, GarmentRecord
 from ncs_jax.prepare.retarget import body_names
 
-__all__ = ["Cloth", "Skin", "cloth_of", "large_loops", "pierced", "skin_of", "threaded", "wearing_faults"]
+__all__ = ["Cloth", "Skin", "beside_middle", "cloth_of", "large_loops", "pierced", "skin_of", "threaded", "wearing_faults"]
 
 POINTS = 20000  # that stand for the skin
 STEP = 1 / 80  # of the body's height: bones are followed in such steps
@@ -23,6 +23,7 @@ FAR = 1 / 8  # of the body's height: cloth that is farther from the skin is told
 NAMED = 6  # joints that a fault names
 WORN = 0.99  # of the length of its openings has the body in it
 SMALL = 1 / 12  # of the body's height: an opening that is shorter is a buttonhole
+MOSTLY, ALIKE = 0.95, 1 / 160  # of a garment's vertices; and of the body's height, a mean: what is alike left and right
 OFF = np.array([1.3e-4, 0.7e-4, 2.1e-4])  # m; a bone must not run along the symmetric edges of a mesh
 
 
@@ -134,6 +135,23 @@ def cloth_of(garment: GarmentRecord, count: int) -> Cloth:
     return Cloth(points, normals * np.sign(volume), area, (low + high) / 2, float(volume), loops)
 
 
+def beside_middle(x: np.ndarray, faces: np.ndarray, skin: Skin) -> float | None:
+    """Return how far aside of the body's middle that of a garment is, m, vertices (V, 3); None unless both are alike left and
+    right: mirrored, most of its vertices have another one within an edge, and the skin lies on itself."""
+    from scipy.spatial import cKDTree
+
+    def middle(points: np.ndarray) -> float:
+        return float(points[:, 0].min() + points[:, 0].max()) / 2
+
+    def apart(points: np.ndarray, tree) -> np.ndarray:
+        return tree.query(points * [-1, 1, 1] + [2 * middle(points), 0, 0])[0]
+
+    edge = np.linalg.norm(x[faces[:, 0]] - x[faces[:, 1]], axis=1).mean()
+    if np.quantile(apart(x, cKDTree(x)), MOSTLY) > edge or apart(skin.points, skin.tree).mean() > ALIKE * skin.height:
+        return None
+    return middle(x) - middle(skin.points)
+
+
 def pierced(x: np.ndarray, faces: np.ndarray, skin: Skin) -> list[int]:
     """Return the joints whose bones pass through triangles (F, 3) of vertices (V, 3)."""
     return sorted({int(j) for j in skin.joints[_crossing(skin.bones, x[faces])]})
@@ -211,4 +229,4 @@ def wearing_faults(garment: GarmentRecord, body: BodyRecord) -> Iterator[tuple[s
         yield "openings of the garment", value, "it is beside the body, or across it, and not worn", mend
     else:
         value = f"the body passes through {100 * share:.0f} % of their length at rest, not through all"
-        yield "openings of the garment", value, "it is far too large for this body, or not where it is worn", mend
+        yield "openings of the garment", value, "it is of another size than this body, or not where it is worn", mend

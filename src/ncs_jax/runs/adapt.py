@@ -99,7 +99,8 @@ def adapt(
         vertices = adapted.run.animate("dance.bvh")
 
     Args:
-        run: the run, or its folder. It stays as it is. motions: one or several, as `Run.animate` takes their names.
+        run: the run, or its folder; of one with own terms or an own network, the run that `load_run` opens with these. It stays
+            as it is. motions: one or several, as `Run.animate` takes their names.
         seconds: of training in all. Asked again for more, with the same folder, it goes on for what is left.
         out: run folder to keep it in, as `adapted_folder` names it, for example; None keeps nothing.
         report, say: see `runs.train.train`; KeyboardInterrupt from `report` ends it with a checkpoint, from which it goes on.

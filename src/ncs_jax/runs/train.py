@@ -154,6 +154,8 @@ def _check_options(steps: int | None, minutes: float | None, resume: bool, start
     """Raise an InputError where two options exclude each other."""
     if steps is not None and not isinstance(steps, int | np.integer):
         raise InputError("a whole number expected", field="--steps", value=steps, mend="minutes may have fractions, steps not")
+    if steps is not None and steps < 1:
+        raise InputError("at least one step expected", field="--steps", value=steps, mend="leave it out for the scene's own")
     if steps is not None and minutes is not None:
         raise InputError("either steps or minutes expected", field="--minutes", value=minutes, mend="leave one of them out")
     if resume and start is not None:

@@ -261,7 +261,7 @@ class Scene:
         path = self.path(name)
         if name.startswith("ncs:") or path.exists() or ("#" in path.name and Path(str(path).rpartition("#")[0]).exists()):
             return path  # the file, or an animation in it
-        seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent}"
+        seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent.absolute()}"
         raise InputError("no such file or folder", file=self.source, field=field, value=name, mend=f"check the path{seen}")
 
     def motion_file(self, name: str) -> tuple[Path, MotionSpec]:

@@ -258,7 +258,10 @@ def _no_number(name: str) -> float:
 def _chunks(file: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON and the binary chunk of a .glb."""
     if len(data) < 20 or data[:4] != b"glTF":
-        raise InputError("a .glb that begins with 'glTF' expected", file=file, value=data[:4], mend="export the file again")
+        value, mend = (
+            ("a binary FBX", "name it .fbx") if data.startswith(b"Kaydara FBX") else (data[:4], "export the file again")
+        )
+        raise InputError("a .glb that begins with 'glTF' expected", file=file, value=value, mend=mend)
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
         raise InputError("glTF 2 expected", file=file, field="version", value=version, mend="export it as glTF 2.0")
