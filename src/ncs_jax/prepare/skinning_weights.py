@@ -43,7 +43,7 @@ def hung_weights(garment: GarmentRecord, body: BodyRecord, weights: np.ndarray) 
     x, faces = np.asarray(garment.vertices, np.float64), garment.faces
     if cKDTree(body.vertices).query(x)[0].max(initial=0) <= NEAR:
         return weights
-    within = enclosure(body.vertices, x, faces) > ENCLOSED
+    within = np.abs(enclosure(body.vertices, x, faces)) > ENCLOSED
     inner = body.faces[within[body.faces].all(axis=1)]
     if not len(inner):
         return weights

@@ -86,7 +86,8 @@ def turned_away(
         seen[some[outside]] += 1
     away = np.flatnonzero(faced < AWAY * seen)
     found = np.zeros(len(body.vertices), bool)
-    found[away] = enclosure(body.vertices[away], garment.vertices, garment.faces) < 0
+    within = enclosure(body.vertices[away], garment.vertices, garment.faces)
+    found[away] = (within > -ENCLOSED) & (within < 0)  # below that it is near a sheet, of which no side is the outer one
     return found
 
 
@@ -167,7 +168,7 @@ def touchable_part(scene, body, garment, weights, records) -> np.ndarray:
     blend = blend_from(weights)
     near = touchable(body, garment.vertices, blend, some, reach)
     far = np.flatnonzero(~near)
-    near[far] = enclosure(body.vertices[far], garment.vertices, garment.faces) > ENCLOSED
+    near[far] = np.abs(enclosure(body.vertices[far], garment.vertices, garment.faces)) > ENCLOSED
     untouched = bare_soles(body, garment.vertices) | turned_away(body, garment, blend, some, reach + edge)
     return np.setdiff1d(body.faces[near[body.faces].any(axis=1)], np.flatnonzero(untouched))
 
