@@ -13,8 +13,8 @@ from ncs_jax.scene.spec import CollisionSpec
 __all__ = ["LOAD", "Cover", "contact_for", "least_thickness", "sinking", "vertex_share"]
 
 LOAD = 100.0  # Pa; what presses cloth onto the skin where it carries or turns a garment
-PRESSED = 0.002  # m; contact is stiff enough to be pressed in by no more
-SPARE = 1.5  # motion and what a network learns, as multiples of the least thickness
+PRESSED = 0.00075  # m; contact is stiff enough to be pressed in by no more
+SPARE = 2.0  # motion and what a network learns, as multiples of the least thickness
 NEAR = 0.05  # m; cloth that is farther from the skin is not pressed onto it
 STRETCH = 1.3  # a triangle whose edges become longer by more, pressed onto the skin, spans a gap of the body
 SAMPLED = 1000  # triangles that stand for all
@@ -102,7 +102,7 @@ def contact_for(
 ) -> Cover:
     """Return the contact that keeps the skin covered by a garment, in round numbers, and never below the defaults.
 
-        k = P a / (2 p),    eps = 1.5 (s + P a / (2 k)),    p = `PRESSED`
+        k = P a / (2 p),    eps = 2 (s + P a / (2 k)),    p = `PRESSED`
 
     Args:
         x: (V, 3), faces (F, 3), m. sunk: of `sinking`, m. thickness: if given, this one is kept, m. pieces: as in `sinking`.
