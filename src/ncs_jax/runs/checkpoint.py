@@ -290,7 +290,7 @@ def _quiet():
             log.setLevel(level)
 
 
-def _let_go(seconds: float = 1.0) -> None:
+def _let_go(seconds: float = 3.0) -> None:
     """Wait until what else was being read has ended: what it says comes as it ends, and as it is collected."""
     for _ in range(10):
         gc.collect()
