@@ -264,17 +264,17 @@ def answers(run, requests):
 def test_frames_in_a_row_are_those_of_animate(method):
     assembly, params, motion = ready(jnp.float32, method)
     run = Run(assembly, params)
-    whole, count = run.animate(motion, 1.5), len(motion.poses)
+    whole, count = run.animate(motion, 1.5, outside=True), len(motion.poses)
     kinds = [BEGIN, *[NEXT] * (count - 1)]
     np.testing.assert_allclose(answers(run, frames(motion, kinds, [1.5] * count)), whole, rtol=0, atol=1e-5)
     asked = frames(motion, kinds, [1.5] * count)
     others = (AGAIN, 0.0), (AGAIN, 1.5), (BEGIN, 1.5)
     static, again, anew = (frames(motion, [kind] * count, [alpha] * count) for kind, alpha in others)
     other = answers(run, [*asked[:9], static[8], again[8], *asked[9:12], anew[12], *asked[13:]])
-    np.testing.assert_allclose(other[9], run.animate(motion, 0.0)[8], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(other[9], run.animate(motion, 0.0, outside=True)[8], rtol=0, atol=1e-5)
     kept = [*range(8), 10, 11, 12, 13]  # 8 and 9 were taken back
     np.testing.assert_allclose(other[kept], whole[:12], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(other[14], run.animate(motion, 0.0)[12], rtol=0, atol=1e-5)  # without a past
+    np.testing.assert_allclose(other[14], run.animate(motion, 0.0, outside=True)[12], rtol=0, atol=1e-5)  # without a past
     assert np.abs(other[15] - whole[13]).max() > 1e-4
     with pytest.raises(InputError, match="alpha: a number from 0 to 10"):
         answers(run, frames(motion, kinds, [-1.0] * count))
@@ -294,7 +294,7 @@ def test_the_command_streams(tmp_path):
         time.sleep(0.1)
     asked = frames(motion, [BEGIN, *[NEXT] * (len(motion.poses) - 1)], [1.0] * len(motion.poses))
     found = [worker.frame(int(r[0]), r[1], r[5:].reshape(2, 3, 3), r[2:5]) for r in asked]
-    np.testing.assert_allclose(found, run.animate(motion), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found, run.animate(motion, outside=True), rtol=0, atol=1e-5)
     worker.close()
     gone = Worker([sys.executable, "-m", "ncs_jax.cli"], tmp_path / "run", skeleton)
     with pytest.raises(pose.Wrong, match="no run there"):
@@ -345,13 +345,13 @@ def test_baked_and_live_frames_are_those_of_animate(in_blender):
     folder, truth = in_blender
     work = folder / "hero_ncs" / "trained_1"
     run = load_run(work / "run")
-    first = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 1.25)
-    second = run.animate(run.motion(str(work / "motions" / "Turn.npz")), 1.25)
+    first = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 1.25, outside=True)
+    second = run.animate(run.motion(str(work / "motions" / "Turn.npz")), 1.25, outside=True)
     assert min(np.ptp(x, axis=0).max() for x in (first, second)) > 0.1 and np.abs(first - second).max() > 0.1
     np.testing.assert_allclose(truth["baked"], second, rtol=0, atol=1e-4)
     np.testing.assert_allclose(truth["live"], second, rtol=0, atol=1e-4)
     np.testing.assert_allclose(truth["other"], first, rtol=0, atol=1e-4)
-    static = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 0.0)
+    static = run.animate(run.motion(str(work / "motions" / "Armature_mixamo.com_Layer0.npz")), 0.0, outside=True)
     np.testing.assert_allclose(truth["static"], static[-1], rtol=0, atol=1e-4)
     assert 0.01 < np.abs(truth["by_hand"] - truth["static"]).max() < 1.0
     assert float(truth["ms"]) < 1000 / 24
@@ -367,7 +367,7 @@ def test_alpha_has_keys(in_blender):
     np.testing.assert_allclose(truth["keyed_baked"], truth["keyed_live"], rtol=0, atol=1e-6)
     for frame, alpha in ((0, 0.0), (-1, 2.0)):
         np.testing.assert_allclose(
-            truth["keyed_baked"][frame], run.animate(run.motion(motion), alpha)[frame], rtol=0, atol=1e-4
+            truth["keyed_baked"][frame], run.animate(run.motion(motion), alpha, outside=True)[frame], rtol=0, atol=1e-4
         )
     assert np.abs(truth["keyed_baked"] - truth["other"]).max() > 1e-4
 

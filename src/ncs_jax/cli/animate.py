@@ -41,6 +41,11 @@ def add_commands(commands) -> None:
         "--rank", type=arguments.whole, help="make the decoder smaller for this motion: its rank, say 64; prints the error"
     )
     parser.add_argument("--bfloat16", action="store_true", help="keep the decoder in 16 bits; prints the error")
+    parser.add_argument(
+        "--as-trained",
+        action="store_true",
+        help="leave cloth in the body where the network has it there (default: put out)",
+    )
     parser.add_argument("--notes", action="store_true", help="print all that was done to bring --motion onto the skeleton")
     parser.add_argument("--out", required=True, metavar="FILE", help=f"{arguments.FORMATS}; or .mp4, a video")
     parser.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
@@ -95,14 +100,15 @@ def animate(options) -> int:
         if run.assembly.body is None:
             raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
         worn_by = run.assembly.body, motion
-    vertices, error = run.animate(motion, options.alpha), ""
+    outside = not options.as_trained
+    vertices, error = run.animate(motion, options.alpha, outside=outside), ""
     if options.rank or options.bfloat16:
         run = run.compressed(motion, rank=options.rank or 0, bfloat16=options.bfloat16)
-        whole, vertices = vertices, run.animate(motion, options.alpha)
+        whole, vertices = vertices, run.animate(motion, options.alpha, outside=outside)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     if options.refine:
-        vertices = _refined(run, motion, options.alpha, options.refine)
+        vertices = _refined(run, motion, options.alpha, options.refine, outside)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
     if suffix == ".mp4":
@@ -150,7 +156,7 @@ def _write_video(run: Run, motion: MotionRecord, vertices: np.ndarray, options) 
         animation_mp4(options.out, shown, report=lambda share: progress.show("drawing the video", share, 1.0))
 
 
-def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int) -> np.ndarray:
+def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int, outside: bool = False) -> np.ndarray:
     """Return the animation after some iterations of the solver on every frame, with a bar."""
     from ncs_jax.cli.progress import WorkProgress
 
@@ -159,6 +165,7 @@ def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int) -> n
             motion,
             alpha,
             refine=iterations,
+            outside=outside,
             report=lambda frame, frames: progress.show(f"refining frame {frame}/{frames}", frame, frames),
         )
 

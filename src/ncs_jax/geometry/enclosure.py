@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["ENCLOSED", "enclosure", "facing"]
+__all__ = ["ENCLOSED", "beside", "enclosure", "facing"]
 
 ENCLOSED = 0.25  # of a full turn: what a garment surrounds by so much at rest is within it, however far the garment stands off
 
@@ -27,6 +27,15 @@ def enclosure(x: np.ndarray, garment: np.ndarray, faces: np.ndarray) -> np.ndarr
         cubed = np.maximum(np.einsum("pvi,pvi->pv", apart, apart), 1e-12) ** 1.5
         found[some] = sign * np.sum(np.einsum("pvi,vi->pv", apart, area) / cubed, axis=1) / (4 * np.pi)
     return found
+
+
+def beside(x: np.ndarray, garment: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return which points (points,) are beside a garment, as an arm is beside a dress: neither in it nor before an opening.
+
+    There `enclosure` is negative, but near a flat sheet, of which no side is the outer one, it is beyond `-ENCLOSED`.
+    """
+    within = enclosure(x, garment, faces)
+    return (within > -ENCLOSED) & (within < 0)
 
 
 def facing(garment: np.ndarray, faces: np.ndarray) -> float:

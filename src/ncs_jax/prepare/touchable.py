@@ -10,7 +10,7 @@ import numpy as np
 from ncs_jax import io
 from ncs_jax.energies.contact.points import contact_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
-from ncs_jax.geometry.enclosure import ENCLOSED, enclosure, facing
+from ncs_jax.geometry.enclosure import ENCLOSED, beside, enclosure, facing
 from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
 from ncs_jax.io.mesh.surface import boundary_loops
@@ -68,7 +68,7 @@ def turned_away(
 
     An arm touches a garment of the trunk by its inner side. If cloth touched the outer side too, an arm that presses into the
     garment would push half of it out around itself, and never get free. What is in the garment at rest, or before an opening as
-    a shin below a hem is, may be touched from all sides: there `enclosure` is not negative.
+    a shin below a hem is, may be touched from all sides: see `enclosure.beside`.
 
     poses, reach: see `touchable`.
     """
@@ -86,8 +86,7 @@ def turned_away(
         seen[some[outside]] += 1
     away = np.flatnonzero(faced < AWAY * seen)
     found = np.zeros(len(body.vertices), bool)
-    within = enclosure(body.vertices[away], garment.vertices, garment.faces)
-    found[away] = (within > -ENCLOSED) & (within < 0)  # below that it is near a sheet, of which no side is the outer one
+    found[away] = beside(body.vertices[away], garment.vertices, garment.faces)
     return found
 
 

@@ -76,12 +76,14 @@ class Run:
         alpha: float = 1.0,
         *,
         refine: int = 0,
+        outside: bool = False,
         report: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
         """Return garment vertices (frames, verts, 3) in m over a motion; alpha sets how much it moves.
 
         refine: iterations of the solver on every frame, see `simulation.refinement`; `report` is called after each with the
-        frame, and of how many.
+        frame, and of how many. outside: what lies inside the body, or too near to it, is put outside in each frame by itself,
+        see `runs.outside`; no energy is asked, and a network is measured without it.
 
         Raises:
             InputError: alpha is not from 0 to 10; or a vertex is not finite: where, and what was so first.
@@ -96,14 +98,18 @@ class Run:
             raise InputError(
                 "finite vertices expected", file=what, field=broken, value=f"alpha {alpha:g}", mend="see ncs check"
             )
-        if not refine:
-            return x
         if refine < 0:
             raise InputError("no fewer than 0 iterations expected", field="refine", value=refine)
-        self.check_terms()
-        from ncs_jax.runs.refine import refined  # the solver, which is not loaded otherwise
+        if refine:
+            self.check_terms()
+            from ncs_jax.runs.refine import refined  # the solver, which is not loaded otherwise
 
-        return refined(a, track, x, refine, report)
+            x = refined(a, track, x, refine, report)
+        if not outside:
+            return x
+        from ncs_jax.runs.outside import outside_body
+
+        return outside_body(a.model, track, x)
 
     def compressed(self, motion: str | io.MotionRecord | MotionFeatures, *, rank: int = 0, bfloat16: bool = False) -> Run:
         """Return this garment with a smaller decoder, made for what it does in a motion: see `compression.compress`.

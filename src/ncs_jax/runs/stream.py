@@ -9,8 +9,9 @@ import jax
 import numpy as np
 
 from ncs_jax.errors import check_alpha
-from ncs_jax.geometry.skinning import to_rest_axes
+from ncs_jax.geometry.skinning import forward, to_rest_axes, transforms
 from ncs_jax.network.rollout import stepper
+from ncs_jax.runs.outside import outside, pushing
 from ncs_jax.runs.run import Run
 
 __all__ = ["AGAIN", "BEGIN", "NEXT", "serve_frames"]
@@ -29,20 +30,25 @@ def serve_frames(run: Run, source: BinaryIO, sink: BinaryIO) -> int:
 
     and its vertices (verts, 3) in m are written, float32 too. Rotations are those of all joints of the body's file, local and
     since rest, as its motions have them; the translation is the root's since rest, m. `kind` is `BEGIN`, `NEXT` or `AGAIN`.
-    Frames that begin with `BEGIN` and go on with `NEXT` give what `animate` gives. `AGAIN` takes the last frame back first. The
-    program is compiled before the line is written.
+    Frames that begin with `BEGIN` and go on with `NEXT` give what `animate(outside=True)` gives, of a garment over others what
+    `animate` gives. `AGAIN` takes the last frame back first. The program is compiled before the line is written.
     """
     model, body = run.assembly.model, run.assembly.body
     names = [] if body is None else list(body.joint_names)
     names = names or [str(j) for j in range(max(model.source_joints) + 1 if body is None else len(body.parents))]
     chosen, dtype = np.array(model.source_joints), model.garment.mesh.rest.dtype
     rollout = stepper(model, run.assembly.network, run.params)
+    skin = None if model.under else pushing(model)  # where the garments below are, a stream does not know
 
     @jax.jit
     def step(state, rotations, translation, alpha):
         if model.rest_rotations is not None:
             rotations = to_rest_axes(rotations, model.rest_rotations)
-        return rollout.step(state, rotations, translation, alpha)
+        state, x = rollout.step(state, rotations, translation, alpha)
+        if skin is not None:
+            matrices = transforms(model.skeleton, forward(model.skeleton, rotations, translation))
+            x = outside(model, skin, matrices, x)
+        return state, x
 
     def answer(state, frame: np.ndarray):
         check_alpha(float(frame[1]))

@@ -67,7 +67,13 @@ def animated_garment(target: str, scene: str | None = None, motion: str | None =
     if path.is_dir() and (path / "run.json").exists():
         run = load_run(path)
         spec = run.assembly.scene.motion
-        return AnimatedGarment(run, _motions(motion, spec), run.animate, run.assembly.network.controlled, path.name)
+        return AnimatedGarment(
+            run,
+            _motions(motion, spec),
+            functools.partial(run.animate, outside=True),
+            run.assembly.network.controlled,
+            path.name,
+        )
     is_scene = target.startswith("ncs:") or path.suffix == ".toml"
     if not is_scene and scene is None:
         raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")
@@ -354,7 +360,7 @@ def view(
     subject = animated_garment(target, scene, motion)
     first = subject.motions[0]
     others = {
-        Path(name).name: load_run(name).animate(first)
+        Path(name).name: load_run(name).animate(first, outside=True)
         if Path(name).is_dir()
         else read_animation_over(name, subject.run.assembly.model, subject.run.track(first))
         for name in overlays

@@ -50,6 +50,7 @@ def preview(
 ) -> dict[str, float]:
     """Write preview.png, .html, .gif, alphas.png and energies.png into a folder; return how the motion comes out at alpha 1.
 
+    The cloth is put outside of the body, as `ncs animate` does.
     The alphas are in rows, at moments at which they differ most. The picture and the page come first, the measures last, and
     the page is then written again with them. Strain and penetration are exact, of every n-th frame, so that there are no more
     than `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what `metrics.quality`
@@ -76,11 +77,12 @@ def preview(
     tell, title = report or (lambda step: None), title or "Neural cloth simulation"
     tell(PreviewStep(None, "drawing the picture", 0.0))
     track, controlled = run.track(names[0]), run.assembly.network.controlled
-    animation = animation_of(run.assembly, run.motion(names[0]), run.animate(track, float(controlled)))
+    animated = functools.partial(run.animate, track, outside=True)
+    animation = animation_of(run.assembly, run.motion(names[0]), animated(float(controlled)))
     pictures.contact_sheet(sheet := folder / "preview.png", animation, tile=TILE)
 
     tell(PreviewStep(sheet, "writing the page", 0.2))
-    others = {alpha: replace(animation, garment=run.animate(track, alpha)) for alpha in ALPHAS if controlled and alpha != 1}
+    others = {alpha: replace(animation, garment=animated(alpha)) for alpha in ALPHAS if controlled and alpha != 1}
     by_alpha = {f"{alpha:g}": others.get(alpha, animation) for alpha in (ALPHAS if controlled else (0.0,))}
     write = functools.partial(page.write_encoded, played := folder / "preview.html", page.encode(by_alpha), title=title)
     write(facts=(facts := _facts_of_the_run(run, names[0], by_alpha)))

@@ -75,10 +75,13 @@ def with_points(x, points: ContactPoints | None):
     return numbers.concatenate([x, between])
 
 
-def on_vertices(values: Float[Array, "all 3"], points: ContactPoints | None) -> Float[Array, "verts 3"]:
-    """Return what vectors at the vertices and the points, as forces, are at the vertices alone."""
+def on_vertices(
+    values: Float[Array, "all components *poses"], points: ContactPoints | None
+) -> Float[Array, "verts components *poses"]:
+    """Return what is at the vertices and the points, as forces, at the vertices alone."""
     if points is None:
         return values
     verts = len(values) - len(points.corners)
-    each = points.weights.astype(values.dtype)[..., None] * values[verts:, None]
+    weights = points.weights.astype(values.dtype)
+    each = weights.reshape(*weights.shape, *(1,) * (values.ndim - 1)) * values[verts:, None]
     return values[:verts].at[points.corners].add(each)

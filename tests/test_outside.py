@@ -1,0 +1,106 @@
+"""Cloth put out of the body: what lies too deep comes to the margin, and nothing else moves."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ncs_jax.energies.contact.outside import put_outside
+from ncs_jax.energies.contact.points import contact_points, with_points
+from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.metrics.quality import measure
+from ncs_jax.runs.outside import outside_body
+from ncs_jax.runs.run import load_run
+from ncs_jax.runs.train import train
+
+from .scenes import SCENE, swing, write_scene
+from .shapes import ball
+
+RADIUS, MARGIN = 0.2, 0.004
+BALL, TRIANGLES = ball(4, RADIUS)
+
+
+def put(cloth, faces=None, skin=None, bodies=1):
+    """The cloth (verts, 3) about the ball, in so many equal poses; `faces`: with points between its vertices, 3 an edge."""
+    points = None if faces is None else contact_points(faces, np.full(len(faces), 3))
+    surface = surface_from(cloth, BALL, TRIANGLES, points=points)
+    x, body = (jnp.repeat(jnp.asarray(a, jnp.float32)[..., None], bodies, axis=2) for a in (cloth, BALL))
+    skin = np.ones(len(BALL)) if skin is None else skin
+    found = np.asarray(put_outside(x, body, surface, jnp.asarray(skin, jnp.float32), MARGIN))
+    return found, None if points is None else np.asarray(with_points(jnp.asarray(found), points))
+
+
+def around(depths, rng):
+    """Directions, and points by so much inside of the ball."""
+    way = rng.normal(size=(len(depths), 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    return way, way * (RADIUS - np.asarray(depths))[:, None]
+
+
+def test_what_is_a_little_inside_comes_to_the_margin_and_the_rest_stays(rng):
+    depths = np.concatenate([np.linspace(-0.003, 0.015, 40), np.linspace(-0.05, -0.006, 40), np.linspace(0.05, 0.15, 40)])
+    way, cloth = around(depths, rng)
+    found, _ = put(cloth, bodies=3)
+    assert np.array_equal(found[..., 0], found[..., 2])
+    moved = found[..., 0] - cloth.astype(np.float32)
+    height = np.linalg.norm(found[..., 0], axis=1) - RADIUS
+    np.testing.assert_allclose(height[:40], MARGIN, atol=1e-3)  # the ball is made of triangles of 1.3 cm
+    assert np.linalg.norm(np.cross(way[:40], moved[:40]), axis=1).max() < 2e-3
+    assert not moved[40:].any()
+
+
+def test_skin_that_does_not_push_lets_cloth_be(rng):
+    _, cloth = around(np.full(60, 0.008), rng)
+    found, _ = put(cloth, skin=(BALL[:, 0] > 0).astype(float))
+    moved = np.linalg.norm(found[..., 0] - cloth.astype(np.float32), axis=1)
+    assert moved[cloth[:, 0] > 0.02].min() > 0.01 and not moved[cloth[:, 0] < -0.02].any()
+
+
+def test_what_is_inside_between_vertices_is_carried_out_by_its_corners():
+    """A triangle over the ball's top whose corners are outside, and whose middle is not."""
+    corner = np.array([[0.05, 0, 0], [-0.025, 0.045, 0], [-0.025, -0.045, 0]]) + [0, 0, 0.199]
+    faces = np.array([[0, 1, 2]])
+    assert np.linalg.norm(corner, axis=1).min() > RADIUS + MARGIN > RADIUS > np.linalg.norm(corner.mean(axis=0))
+    _, every = put(corner, faces)
+    height = np.linalg.norm(every[..., 0], axis=1) - RADIUS
+    assert height.min() > MARGIN - 1.5e-3, height
+    alone, _ = put(corner)
+    assert np.array_equal(alone[..., 0], corner.astype(np.float32))
+
+
+@pytest.fixture
+def _plain(plain_jax):
+    yield
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("outside")
+    with jax.enable_x64(False), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        train(write_scene(folder, SCENE), folder / "run", steps=2)
+        run = load_run(folder / "run")
+    np.savez(folder / "clip.npz", **swing(frames=40))
+    return run, str(folder / "clip.npz")
+
+
+def test_an_animation_is_put_outside_of_its_body(trained, _plain):
+    """Pressed into the post by two centimetres, in more frames than are done at once."""
+    run, clip = trained
+    model, track = run.assembly.model, run.track(clip)
+    pressed = run.animate(clip) - np.float32([0, 0, 0.02])
+    out = outside_body(model, track, pressed)
+    assert out.shape == pressed.shape and out.dtype == pressed.dtype
+    inside, left = (measure(model, x, track)["depth_max"] for x in (pressed, out))
+    assert np.median(inside) > 5 and left.max() < 0.25 * inside.max(), (inside, left)  # the post has twelve sides
+    far = np.linalg.norm(out - pressed, axis=2)
+    assert 0 < np.mean(far > 0) < 0.9
+    np.testing.assert_array_equal(outside_body(model, track, pressed[:5]), out[:5])
+    np.testing.assert_array_equal(run.animate(clip, outside=True), outside_body(model, track, run.animate(clip)))
+
+
+def test_without_contact_nothing_is_put_anywhere(trained, _plain):
+    run, clip = trained
+    x = run.animate(clip)
+    assert outside_body(replace(run.assembly.model, surface=None), run.track(clip), x) is x
