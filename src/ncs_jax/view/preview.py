@@ -50,12 +50,11 @@ def preview(
 ) -> dict[str, float]:
     """Write preview.png, .html, .gif, alphas.png and energies.png into a folder; return how the motion comes out at alpha 1.
 
-    The cloth is put outside of the body, as `ncs animate` does.
-    The alphas are in rows, at moments at which they differ most. The picture and the page come first, the measures last, and
-    the page is then written again with them. Strain and penetration are exact, of every n-th frame, so that there are no more
-    than `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what `metrics.quality`
-    says of penetration; every, n; measured, frames. Where skin is 1 mm outside: bare, in how many; barest, the worst. Curves
-    need a log and matplotlib.
+    Cloth is put outside of the body, as by `ncs animate`. Alphas are in rows, where they differ most. The picture and the page
+    come first, the measures last, and the page is then written again with them. Strain and penetration are exact, of every
+    n-th frame, at most `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what
+    `metrics.quality` says of penetration; every, n; measured, frames. Where skin is 1 mm outside: bare, in how many; barest,
+    the worst. Curves need a log and matplotlib.
 
     Args:
         run: trained.
