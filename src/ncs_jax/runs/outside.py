@@ -16,7 +16,7 @@ from ncs_jax.scene.model import Model, pose_body, resting_body
 __all__ = ["outside", "outside_body", "pushing"]
 
 BLOCK = 32  # frames at a time
-MARGIN = 0.5  # of the contact's thickness; cloth at rest lies farther out
+MARGIN = 0.75  # of the thickness: with half of it a knee still showed between points; cloth at rest lies farther out
 
 
 def pushing(model: Model) -> Float[Array, "body"] | None:
@@ -33,7 +33,7 @@ def pushing(model: Model) -> Float[Array, "body"] | None:
 def outside(
     model: Model, skin: Float[Array, "body"], matrices: Float[Array, "joints 3 4 *poses"], x: Float[Array, "verts 3 *poses"]
 ) -> Float[Array, "verts 3 *poses"]:
-    """Return the garment put outside of the body on these joints by `put_outside`, to half of the contact's thickness, m."""
+    """Return the garment put outside of the body by `put_outside`, to `MARGIN` of the contact's thickness, m."""
     surface = required(model.surface, "model.surface")
     return put_outside(x, pose_body(model, matrices), surface, skin, MARGIN * model.material.thickness)
 
