@@ -67,13 +67,8 @@ def animated_garment(target: str, scene: str | None = None, motion: str | None =
     if path.is_dir() and (path / "run.json").exists():
         run = load_run(path)
         spec = run.assembly.scene.motion
-        return AnimatedGarment(
-            run,
-            _motions(motion, spec),
-            functools.partial(run.animate, outside=True),
-            run.assembly.network.controlled,
-            path.name,
-        )
+        animate = functools.partial(run.animate, outside=True)
+        return AnimatedGarment(run, _motions(motion, spec), animate, run.assembly.network.controlled, path.name)
     is_scene = target.startswith("ncs:") or path.suffix == ".toml"
     if not is_scene and scene is None:
         raise InputError("the scene of the animation is needed", file=target, field="--scene", mend="add --scene SCENE")

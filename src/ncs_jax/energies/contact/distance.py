@@ -12,7 +12,7 @@ from ncs_jax.geometry.closest_point import closest_weights, gap_to
 from ncs_jax.geometry.numerics import angle_between, normalize
 from ncs_jax.geometry.soa_vectors import dot, minus
 
-__all__ = ["nearest_distance", "plane_distance", "triangle_distance"]
+__all__ = ["gathered", "nearest_distance", "plane_distance", "triangle_distance"]
 
 
 def plane_distance(
@@ -25,14 +25,18 @@ def plane_distance(
 
     Its value jumps where the nearest vertex changes, so a finite difference across a jump does not meet the gradient.
     """
+    return dot(gathered(normals, index), minus([x[:, i] for i in range(3)], gathered(body, index)))
+
+
+def gathered(table: Float[Array, "body 3 *poses"], index: Int[Array, "verts *poses"]) -> list[Float[Array, "verts *poses"]]:
+    """Return the three components of rows of a table, in every pose those that it names there.
+
+    Each by itself, which on a CPU is gathered several times faster than rows of three.
+    """
     poses = index[:1].size
     at = index.reshape(-1, poses) * poses + jnp.arange(poses, dtype=index.dtype)[None]
-
-    def near(table):  # each component by itself, which on a CPU is gathered several times faster than rows of three
-        flat = [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
-        return [component.reshape(index.shape) for component in flat]
-
-    return dot(near(normals), minus([x[:, i] for i in range(3)], near(body)))
+    flat = [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
+    return [component.reshape(index.shape) for component in flat]
 
 
 def triangle_distance(

@@ -7,9 +7,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.contact.between import with_between
+from ncs_jax.energies.contact.distance import gathered
 from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.points import on_vertices, with_points
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
+from ncs_jax.geometry.soa_vectors import dot, minus
 
 __all__ = ["put_outside"]
 
@@ -43,11 +45,10 @@ def put_outside(
     def once(_, x):
         p = with_points(x, surface.points)
         index = with_between(p, body, nearest_vertex(x, body, surface)[0], surface)
-        normal, near = (jnp.take_along_axis(a, index[:, None], axis=0) for a in (normals, body))
-        gap = p - near
-        share = skin[index] * jnp.clip((FAR - jnp.linalg.norm(gap, axis=1)) / (FAR - NEAR), 0, 1)
-        short = share * jnp.maximum(margin - jnp.sum(normal * gap, axis=1), 0)
-        moved = on_vertices(short[:, None] * normal, surface.points)
+        normal, gap = gathered(normals, index), minus([p[:, i] for i in range(3)], gathered(body, index))
+        share = skin[index] * jnp.clip((FAR - jnp.sqrt(dot(gap, gap))) / (FAR - NEAR), 0, 1)
+        short = share * jnp.maximum(margin - dot(normal, gap), 0)
+        moved = on_vertices(jnp.stack([short * n for n in normal], axis=1), surface.points)
         carried = on_vertices((short > 0)[:, None].astype(x.dtype), surface.points)
         return x + jnp.where(carried > 0, moved / jnp.where(carried > 0, carried, 1), 0)
 
