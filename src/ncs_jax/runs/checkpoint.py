@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import gc
 import json
 import logging
 import os
 import re
 import shutil
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -214,8 +212,8 @@ class Checkpoints:
                     return ocp.load(folder, shapes, checkpointable_name=NAME)
             except Exception as error:  # Orbax and its store have no common error class
                 reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
-            _let_go()
             self._check_network(folder, like)
+        _stay_quiet()
         mend = "delete this folder to go back to the checkpoint before it"
         raise InputError(f"the checkpoint cannot be read: {reason}", file=folder, mend=mend)
 
@@ -275,11 +273,14 @@ def _alone(ocp):
     return context
 
 
+QUIET = ("asyncio", "absl")
+
+
 @contextlib.contextmanager
 def _quiet():
     """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    logs = {log: log.level for log in map(logging.getLogger, ("asyncio", "absl"))}
+    logs = {log: log.level for log in map(logging.getLogger, QUIET)}
     for log in logs:
         log.setLevel(logging.CRITICAL + 1)
     try:
@@ -290,8 +291,20 @@ def _quiet():
             log.setLevel(level)
 
 
-def _let_go(seconds: float = 3.0) -> None:
-    """Wait until what else was being read has ended: what it says comes as it ends, and as it is collected."""
-    for _ in range(10):
-        gc.collect()
-        time.sleep(seconds / 10)
+LATE = ('Error opening "', "Event loop is closed")  # what is said of arrays that were still being read
+
+
+def _stay_quiet() -> None:
+    """Say nothing of the others as long as this process lives: some of them end with it, whenever that is."""
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda late: None if _is_late(late.exc_value) else hook(late)
+    for log in map(logging.getLogger, QUIET):
+        log.addFilter(_in_time)
+
+
+def _in_time(record: logging.LogRecord) -> bool:
+    return not _is_late(record.getMessage(), *(record.exc_info or ()))
+
+
+def _is_late(*said: object) -> bool:
+    return any(part in str(each) for each in said for part in LATE)
