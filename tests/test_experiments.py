@@ -3,6 +3,7 @@
 import csv
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from experiments import (
     spread,
     stability,
     study,
+    unseen,
 )
 from ncs_jax import InputError, assemble, load_scene, scene_from
 from ncs_jax.io import read_body, read_motion
@@ -86,7 +88,7 @@ def test_speed_accuracy(tmp_path, capsys):
 @pytest.fixture
 def alone(monkeypatch):
     """Everything in this process: starting others takes longer than what they do here."""
-    for module in (control, garments, methods):
+    for module in (control, garments, methods, unseen):
         monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
     for module in (study, garments, methods, architecture, budget, descriptors):
         monkeypatch.setattr(module, "abreast", lambda jobs: [job(*arguments) for job, *arguments in jobs])
@@ -170,6 +172,27 @@ def test_methods(alone, tmp_path, monkeypatch):
     # the motion stops: a pose without motion stands at once
     assert float(rows["pbns"]["stopped_share"]) == 0 < float(rows["snug"]["stopped_share"])
     assert len(list((tmp_path / "kept" / "simulations").glob("*.npz"))) == len(methods.SIMULATIONS)
+
+
+def test_unseen(alone, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study, "COARSE", 50.0)
+    monkeypatch.setattr(unseen, "adapt", lambda run, motion, seconds: SimpleNamespace(run=run, after=asked.append(seconds)))
+    asked: list[float] = []
+    text = FREE.replace("smoothing = 2", 'smoothing = 2\npins = "pins"').replace('validation = ["swing.npz"]', "")
+    scene, out = write_scene(tmp_path, text), tmp_path / "out"
+    np.savez(tmp_path / "sway.npz", **swing(frames=12, size=0.3))
+    given = ["--unseen", str(tmp_path / "sway.npz"), "--out", str(out), "--kept", str(tmp_path / "kept")]
+    assert unseen.main([str(scene), "--quick", "--adapt", "3", *given]) == 0
+    with (out / "unseen.csv").open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert list(rows) == [*methods.SIMULATIONS.values(), "ncs", "ncs, adapted", "pbns", "pbns, adapted"]
+    ours, coarse, static, ncs, adapted, pbns, _ = rows.values()
+    assert {row["motion"] for row in rows.values()} == {"sway"} and asked == [3, 3]
+    assert float(ours["distance"]) == 0 < float(coarse["distance"]) == float(ncs["sensitivity"]) < float(static["distance"])
+    assert float(ncs["distance"]) != float(pbns["distance"]) and not pbns["dynamic_factor"]
+    assert float(adapted["minutes"]) == pytest.approx(float(ncs["minutes"]) + 0.05) and adapted["total"] == ncs["total"]
+    assert (out / "unseen_sway.png").read_bytes()[:4] == b"\x89PNG" and "| sway | ncs |" in capsys.readouterr().out
+    assert unseen.main([str(tmp_path / "nowhere.toml")]) == 2
 
 
 def write_sleeve(file, radius=0.085, bottom=0.5, unit=1.0):
