@@ -570,7 +570,9 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
 
 
 @pytest.mark.parametrize(
-    ("name", "trained"), [("a.bvh", True), ("a.bvh[3:9]", False), ("b.bvh[3:9]", True), ("ncs:walk", True), ("c.bvh", False)]
+    ("name", "trained"),
+    [("a.bvh", True), ("a.bvh[3:9]", True), ("b.bvh[3:9]", True), ("b.bvh[:4]", True), ("b.bvh[5:7]", True), ("b.bvh", True)]
+    + [("b.bvh[:3]", False), ("b.bvh[9:]", False), ("b.bvh[-4:]", True), ("ncs:walk", True), ("c.bvh", False)],
 )
 def test_what_a_run_was_trained_on_is_known_from_any_folder(tmp_path, monkeypatch, name, trained):
     monkeypatch.chdir(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+import warnings
 from dataclasses import replace
 
 import flax.linen as nn
@@ -192,7 +193,9 @@ def test_arrays_of_another_shape_are_refused_before_they_give_numbers(folder, tr
     track = trained.track(str(folder / "swing.npz"))
     joints, frames, verts = len(model.skeleton.parents), len(track.start), len(model.basis)
     eye, root = jnp.broadcast_to(jnp.eye(3), (joints, 3, 3)), jnp.zeros(3)
+    pair, two = jnp.stack([eye, eye]), jnp.zeros((2, 3))
     step(init(), eye, root)
+    step(init(2), pair, two, jnp.array([0.0, 1.0]))
     garment = np.zeros((frames, verts, 3))
     for wrong, match in {
         lambda: step(init(), eye[:-1], root): "rotations",
@@ -201,6 +204,9 @@ def test_arrays_of_another_shape_are_refused_before_they_give_numbers(folder, tr
         lambda: step(init(), eye[..., 0], root): "rotations",
         lambda: step(init(), eye.astype(int), root): "rotations: floating-point",
         lambda: step(init(), eye, root[:1]): "translation",
+        lambda: step(init(), eye, root, jnp.ones(1)): r"alpha: one number expected \(found 'shape \(1,\)'",
+        lambda: step(init(2), pair, two, jnp.ones((2, 1))): r"alpha: one number, or one for every character, \(2,\), expected",
+        lambda: step(init(2), pair, two, jnp.ones(3)): "alpha: one number, or one for every",
         lambda: ncs_jax.local_rotations(model, jnp.zeros((4, max(model.source_joints), 3))): "poses",
         lambda: ncs_jax.frame_inputs(model, track, frames): "frame: a frame from 0",
         lambda: ncs_jax.measure(model, garment[:, 1:], track): "vertices",
@@ -290,6 +296,31 @@ def test_a_term_of_the_velocity_is_refused_before_vibrations_are_looked_for(fold
         ncs_jax.assemble(swings, terms=[push, drag])
     with pytest.raises(AssertionError, match="looked for"):  # by terms that do without
         ncs_jax.assemble(swings, terms=[push, hook])
+
+
+@pytest.mark.parametrize(
+    ("term", "match"),
+    [
+        (lambda x, step: x.sum(axis=1), "a scalar expected"),
+        (lambda x, step: float(np.asarray(x).sum()), r"a term of jax\.numpy expected.*use jax\.numpy in the place of NumPy"),
+        (lambda x, step: x.sum() if x.sum() > 0 else 0.0, r"a term of jax\.numpy expected.*jnp\.where in that of if"),
+    ],
+    ids=["vector", "NumPy", "if"],
+)
+def test_a_term_that_no_training_can_take_is_refused_at_once(folder, plain_jax, term, match):
+    term.__name__ = "mine"
+    with pytest.raises(InputError, match=f"terms: mine: {match}"):
+        ncs_jax.assemble(scene(folder), terms=[push, term])
+
+
+def test_a_run_begun_from_one_with_own_terms_says_that_it_is_without(folder, trained, plain_jax):
+    with pytest.warns(
+        InputWarning, match=r"run was trained with terms of one's own, push, hook, and this run is trained without"
+    ):
+        ncs_jax.train(scene(folder), None, steps=10, start=folder / "run")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        ncs_jax.train(scene(folder), None, steps=10, terms=[push, hook], start=trained)
 
 
 def test_a_motion_as_arrays_is_animated(folder, trained, plain_jax):

@@ -265,6 +265,6 @@ def _draw(out: str, setting: Setting, groups: Sequence[Sequence[str]]) -> str:
                   for group in groups[:DRAWN] for name in group[:1]}  # fmt: skip
         motion_sheet(out, setting, chosen)
     except Exception as error:  # a check is worth as much without its picture
-        return f"none: {type(error).__name__} {error}"
+        return f"none: {error if isinstance(error, InputError) else f'{type(error).__name__} {error}'}"
     left = f"; {len(groups) - DRAWN} other kinds of motion are not drawn" if len(groups) > DRAWN else ""
     return f"{out}: each motion on the character, and below as it was recorded: both must do the same{left}"

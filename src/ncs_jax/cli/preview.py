@@ -8,6 +8,7 @@ from pathlib import Path
 from ncs_jax.cli import arguments
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.errors import InputError
+from ncs_jax.scene.motion_names import split_frames
 
 __all__ = ["add_commands", "check_video", "draw", "preview"]
 
@@ -66,7 +67,10 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
     inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
     never += f", one frame in {quantities['every']:.0f}" if quantities["every"] > 1 else ""
     print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
-    _say_bare(quantities, run.assembly.scene.physics.collision.thickness)
+    _say_bare(quantities, scene.physics.collision.thickness)
+    others = len({*scene.motion.validation, *scene.motion.files}) - 1
+    if motion is None and others:
+        print(f"  nothing of its {others} other motions: ncs preview RUN --motion FILE draws and measures another")
     return quantities
 
 
@@ -84,5 +88,15 @@ def _say_bare(quantities: dict[str, float], thickness: float) -> None:
 
 
 def _is_trained_on(files: Sequence[str], name: str) -> bool:
-    """Tell whether a motion, perhaps named from the current folder, is among the files of a run, whose paths are absolute."""
-    return name in files or str(Path(name).absolute()) in files
+    """Tell whether a motion, perhaps named from the current folder, shares frames with a run's files, of absolute paths."""
+    file, frames = split_frames(name)
+    return any(
+        _overlap(frames, other) for known, other in map(split_frames, files) if known in (file, str(Path(file).absolute()))
+    )
+
+
+def _overlap(*cuts: tuple[int, ...] | None) -> bool:
+    """Tell whether two cuts of one motion share frames, as far as their numbers tell."""
+    starts, stops = zip(*((cut[0], cut[1] if len(cut) > 1 else None) if cut else (0, None) for cut in cuts), strict=True)
+    counted = all(number is None or number >= 0 for number in (*starts, *stops))  # else from an end that is not known here
+    return not counted or max(starts) < min((stop for stop in stops if stop is not None), default=max(starts) + 1)

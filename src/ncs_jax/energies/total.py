@@ -160,6 +160,12 @@ def _own_energy(term: OwnTerm, x, step: StepInputs):
     """Return the energy by a term of one's own, J, after a check that it is a scalar."""
     try:
         value = term(x, step)
+    except jax.errors.JAXTypeError as fault:  # such as NumPy on what is traced
+        reason = str(fault).strip().splitlines()[0]
+        raise InputError(
+            f"a term of jax.numpy expected, which can be traced: {reason}", field=f"terms: {term.__name__}",
+            mend="use jax.numpy in the place of NumPy, and jnp.where in that of if",
+        ) from fault  # fmt: skip
     except (TypeError, AttributeError) as fault:
         if step.previous is not None and step.before is not None:
             raise

@@ -55,7 +55,7 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
     what `animate` gives. Pass alpha as a float: for 1 in the place of 1.0 `jax.jit` compiles the step again.
 
     With a state from `init(256)` all these have a leading axis, of characters who move by themselves; alpha is one number or
-    one for each. That is two times as fast as `jax.vmap(step)` or more, since what they share is read once for many of them.
+    one for each. That is about twice as fast as `jax.vmap(step)`, and more for large networks: what they share is read once.
     Derivatives are those of reverse mode, `jax.grad`; forward mode, `jax.jvp`, is not defined.
     """
     rest = model.garment.mesh.rest
@@ -94,7 +94,11 @@ def stepper(model: Model, network: Method, params: dict) -> Rollout:
             every = jax.vmap(every)
         now, previous, matrices, static, dynamic = every(state.previous, state.before, state.started, rotations, translation)
         code, codes = network.step(params, model, state.code, static, dynamic, matrices)
-        alpha = jnp.asarray(alpha, code.dtype)[..., None]
+        alpha = jnp.asarray(alpha, code.dtype)
+        if alpha.shape not in ((), characters):
+            what = f"one number, or one for every character, {characters}," if characters else "one number"
+            raise InputError(f"{what} expected", field="alpha", value=f"shape {alpha.shape}", mend="see ncs_jax.stepper")
+        alpha = alpha[..., None]
         x = _posed(model, network, params, weights, matrices, codes.together(alpha), codes.swung(alpha))
         return StreamState(code, now, previous, jnp.ones(characters, bool)), x
 

@@ -18,7 +18,7 @@ from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import InputError, required
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.network.methods.method import Method
-from ncs_jax.network.methods.swing import as_about_the_drape
+from ncs_jax.network.methods.swing import Swing, as_about_the_drape
 from ncs_jax.network.rollout import animated
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.mirroring import mirror_partners
@@ -30,14 +30,14 @@ from ncs_jax.prepare.touchable import surface_of, touchable_faces
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
-from ncs_jax.scene.step_inputs import step_inputs
+from ncs_jax.scene.step_inputs import Past, step_inputs
 from ncs_jax.training.shares import Shares, Stretch, shares_of
 
 __all__ = [
     "Assembly",
     "TrainingMotions",
     "build",
-    "check_static",
+    "check_terms",
     "features_from_records",
     "tell_a_person",
     "training_features",
@@ -147,7 +147,7 @@ def build(
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")
-            check_static(model, terms, known)  # before a minute is spent
+            check_terms(model, terms, known, past=False)  # before a minute is spent
 
             def begin() -> None:
                 (report or tell_a_person)("finding the garment's vibrations, which may take a minute")
@@ -158,20 +158,24 @@ def build(
         scene = cell_of(scene, prepared.vibrations.size > 0, automatic)
         model = replace(model, vibrations=vibrations_of(prepared, dtype) if prepared.vibrations.size else None)
     network = network_from(scene, model)
-    model = model.with_terms(terms) if terms else model
+    if terms:
+        if track is not None and not isinstance(network, Swing):
+            check_terms(model, terms, track, past=True)
+        model = model.with_terms(terms)
     return Assembly(scene, prepared, model, body, setting.garment, setting.motions, network, track, training)
 
 
-def check_static(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures) -> None:
-    """See that terms of one's own do without a past, as a swing trains; nothing is computed.
+def check_terms(model: Model, terms: Sequence[OwnTerm], track: MotionFeatures, *, past: bool) -> None:
+    """See that terms of one's own are energies, and do without a past where a swing is trained; nothing is computed.
 
     Raises:
-        InputError: one does not.
+        InputError: one is not a scalar, cannot be traced, or needs a past that there is not.
     """
     own, alone = model.with_terms(terms), Terms(None, False, None, gravity=False, inertia=False, own=tuple(terms))
 
     def energies(x, matrices):
-        return energy_terms(x, model.garment, model.material, step_inputs(own, matrices), alone)
+        step = step_inputs(own, matrices, Past(x, x, x) if past else None)
+        return energy_terms(x, model.garment, model.material, step, alone)
 
     jax.eval_shape(energies, model.garment.mesh.rest, jax.ShapeDtypeStruct(track.matrices.shape[1:], track.matrices.dtype))
 

@@ -18,7 +18,7 @@ from ncs_jax import io
 from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.methods.choose import network_from
-from ncs_jax.prepare.build import SWING, Assembly, check_static, vibrations_of
+from ncs_jax.prepare.build import SWING, Assembly, check_terms, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
@@ -185,6 +185,10 @@ def _assemble_started(
     run = start if isinstance(start, Run) else load_run(start, network=network)
     name = "a run" if isinstance(start, Run) else str(start)
     before = run.assembly
+    if run.lacking:
+        told = f"{name} was trained with terms of one's own, {', '.join(run.lacking)}, and this run is trained without"
+        mend = "in Python, give terms=[...] and start=load_run(RUN, terms=[...])"
+        warnings.warn(f"{told}; {mend}", category=InputWarning, stacklevel=4)
     _check_swing(before.prepared, name)
     if scene.network.cell == "auto":
         scene = replace(scene, network=replace(scene.network, cell=before.scene.network.cell))
@@ -200,7 +204,7 @@ def _assemble_started(
     # Its vibrations are known: made ready as one that does not swing, no minute is spent on looking for them.
     assembly = make_ready(replace(scene, network=replace(scene.network, cell="gated")) if swings else scene)
     if swings:
-        check_static(assembly.model, assembly.model.terms.own, assembly.track)
+        check_terms(assembly.model, assembly.model.terms.own, assembly.track, past=False)
         assembly = replace(_swinging(before.prepared, assembly), scene=scene)
         assembly = replace(assembly, network=network_from(scene, assembly.model))
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0)).params

@@ -20,12 +20,19 @@ __all__ = ["Past", "frame_inputs", "step_inputs"]
 
 
 class Past(NamedTuple):
-    """The garment before this step; `None` where no term asks for it."""
+    """The garment before this step; `None` where no term asks for it.
 
-    previous: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1}, m
-    before: Float[Array, "verts 3 *poses"] | None = None  # x_{t-2}, m
-    unposed: Float[Array, "verts 3 *poses"] | None = None  # x_{t-1} taken back through skinning, m: what friction advects
-    moving: Float[Array, "*poses"] | None = None  # what inertia and friction count: 0 without a past; None: 1
+    Attributes:
+        previous, before: x_{t-1} and x_{t-2} in m, which inertia reads.
+        unposed: x_{t-1} in m taken back through the skinning of its own frame, which friction advects:
+            `unpose(blend(matrices_before, model.blend), previous)`, both of `geometry.skinning`.
+        moving: what inertia and friction count, 0 in a pose without a past; None: 1.
+    """
+
+    previous: Float[Array, "verts 3 *poses"] | None = None
+    before: Float[Array, "verts 3 *poses"] | None = None
+    unposed: Float[Array, "verts 3 *poses"] | None = None
+    moving: Float[Array, "*poses"] | None = None
 
 
 def step_inputs(
