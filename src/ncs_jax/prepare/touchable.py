@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
+from ncs_jax.energies.contact.beside import Beside
 from ncs_jax.energies.contact.points import contact_points
-from ncs_jax.energies.contact.surface import Surface, surface_from
+from ncs_jax.energies.contact.surface import Surface, compact_groups, surface_from
 from ncs_jax.geometry.enclosure import ENCLOSED, beside, enclosure, facing
 from ncs_jax.geometry.skinning import Blend, blend_from, correctives_from
 from ncs_jax.io.mesh.normals import vertex_normals
@@ -20,6 +22,7 @@ from ncs_jax.scene.model import Layer, Model, pose_body, pose_rest, resting_body
 
 __all__ = [
     "bare_soles",
+    "beside_of",
     "covered_by_layers",
     "submesh",
     "surface_of",
@@ -29,6 +32,7 @@ __all__ = [
     "turned_away",
 ]
 
+SAMPLES = 128  # vertices of a garment, at least, of which the nearest to skin beside it tells where its inside is
 FRAMES = 60  # poses that are looked at, at most
 
 
@@ -142,6 +146,22 @@ def surface_of(
     rest, body = np.asarray(model.garment.mesh.rest), resting_body(model)
     points = contact_points(np.asarray(model.garment.mesh.faces), pieces) if pieces.size else None
     return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)
+
+
+def beside_of(model: Model) -> Beside | None:
+    """Return the skin of the touchable body that is beside the garment; None where none is."""
+    mesh = model.garment.mesh
+    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
+    found = np.flatnonzero(beside(resting_body(model), rest, faces))
+    if not len(found):
+        return None
+    some = np.sort(compact_groups(rest, max(1, len(rest) // SAMPLES))[:, 0])
+    outward = facing(rest, faces) * vertex_normals(rest, faces)
+    dtype = model.basis.dtype
+    weights = Blend(model.blend.weights[some], model.blend.joints)
+    return Beside(
+        jax.device_put(found.astype(np.int32)), jnp.asarray(rest[some], dtype), jnp.asarray(outward[some], dtype), weights
+    )
 
 
 @jax.jit

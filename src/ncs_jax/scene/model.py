@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.contact.beside import Beside, turned_inwards
 from ncs_jax.energies.contact.points import ContactPoints
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.energies.terms import Garment, Material, OwnTerm, Terms
@@ -23,6 +24,7 @@ __all__ = [
     "Layer",
     "Model",
     "RitzModes",
+    "body_normals",
     "local_rotations",
     "pose_body",
     "pose_garment",
@@ -97,6 +99,7 @@ class Model:
     vibrations: RitzModes | None = None  # where the network swings along them
     under: tuple[Layer, ...] = ()  # garments worn below this one
     correctives: Correctives | None = None
+    beside: Beside | None = None  # of the body, where contact is by planes
 
     @property
     def points(self) -> ContactPoints | None:
@@ -162,14 +165,24 @@ def pose_body(model: Model, matrices: Float[Array, "joints 3 4 *poses"]) -> Floa
     return jnp.concatenate([body, rest.reshape(rest.shape + lanes) + matrices[len(model.skeleton.parents) :, :, 3]])
 
 
+def body_normals(
+    model: Model, body: Float[Array, "body 3 *poses"], matrices: Float[Array, "joints 3 4 *poses"]
+) -> Float[Array, "body 3 *poses"]:
+    """Return the normals by which contact by planes goes: of the posed touchable body, `turned_inwards` beside the garment."""
+    surface = required(model.surface, "model.surface")
+    normals = vertex_normals(body, surface)
+    return normals if model.beside is None else turned_inwards(normals, body, matrices, model.beside)
+
+
 def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:
     """Return positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
     frames = len(matrices)
     at = np.minimum(np.arange(-(-frames // lanes) * lanes), frames - 1).reshape(-1, lanes)
 
     def some(matrices):
-        body = pose_body(model, jnp.moveaxis(matrices, 0, -1))
-        return jnp.concatenate([body, vertex_normals(body, model.surface)], axis=1)
+        matrices = jnp.moveaxis(matrices, 0, -1)
+        body = pose_body(model, matrices)
+        return jnp.concatenate([body, body_normals(model, body, matrices)], axis=1)
 
     blocks = lax.map(some, matrices[at])
     return jnp.moveaxis(blocks, -1, 1).reshape(-1, *blocks.shape[1:3])[:frames]

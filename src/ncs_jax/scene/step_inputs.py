@@ -14,7 +14,7 @@ from ncs_jax.energies.total import contact_force
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import blend, skin, unpose
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.scene.model import Model, body_normals, pose_body
 
 __all__ = ["Past", "frame_inputs", "step_inputs"]
 
@@ -57,6 +57,8 @@ def step_inputs(
     posed = normals = None
     if model.surface is not None and (terms.collision is not None or terms.own):
         posed, normals = (pose_body(model, matrices), None) if body is None else (body[:, :3], body[:, 3:])
+        if normals is None and terms.collision == "plane" and model.beside is not None:
+            normals = body_normals(model, posed, matrices)
     if not (terms.pinning or terms.friction or terms.own):
         transforms = None
     elif transforms is None:
