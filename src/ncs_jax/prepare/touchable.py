@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ncs_jax import io
@@ -32,7 +31,7 @@ __all__ = [
     "turned_away",
 ]
 
-SAMPLES = 128  # vertices of a garment, at least, of which the nearest to skin beside it tells where its inside is
+SAMPLES = 64  # vertices of a garment, at least, of which the nearest to skin beside it tells where its inside is
 FRAMES = 60  # poses that are looked at, at most
 
 
@@ -157,11 +156,9 @@ def beside_of(model: Model) -> Beside | None:
         return None
     some = np.sort(compact_groups(rest, max(1, len(rest) // SAMPLES))[:, 0])
     outward = facing(rest, faces) * vertex_normals(rest, faces)
-    dtype = model.basis.dtype
-    weights = Blend(model.blend.weights[some], model.blend.joints)
-    return Beside(
-        jax.device_put(found.astype(np.int32)), jnp.asarray(rest[some], dtype), jnp.asarray(outward[some], dtype), weights
-    )
+    dtype, put = np.asarray(model.basis).dtype, jax.device_put  # from the host: nothing to compile
+    weights = Blend(put(np.asarray(model.blend.weights)[some]), model.blend.joints)
+    return Beside(put(found.astype(np.int32)), put(rest[some].astype(dtype)), put(outward[some].astype(dtype)), weights)
 
 
 @jax.jit

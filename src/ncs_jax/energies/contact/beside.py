@@ -51,9 +51,11 @@ def turned_inwards(
         cloth = skin(carried, found.points)
         middle = jnp.mean(cloth, axis=0)
         cloth = cloth - middle
-        apart = jnp.sum(cloth**2, axis=1) - 2 * jnp.matmul(own - middle, cloth.T, precision="highest")  # less what is the same
+        apart = jnp.sum(cloth**2, axis=1)[:, None] - 2 * jnp.matmul(cloth, (own - middle).T, precision="highest")
+        rows = jnp.arange(len(cloth), dtype=jnp.int32)[:, None]
+        nearest = jnp.min(jnp.where(apart == jnp.min(apart, axis=0), rows, len(cloth) - 1), axis=0)  # faster than argmin
         outward = jnp.sum(carried[:, :, :3] * found.outward[:, None], axis=-1)
-        outward, n = normalize(outward)[jnp.argmin(apart, axis=1)], normals[found.skin]
+        outward, n = normalize(outward)[nearest], normals[found.skin]
         w = jnp.clip(jnp.sum(n * outward, axis=1, keepdims=True) + 0.5, 0, 1)
         return normals.at[found.skin].set(normalize((1 - w) * n - w * outward))
 
