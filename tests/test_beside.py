@@ -19,11 +19,6 @@ from ncs_jax.scene.model import body_normals, pose_body, posed_bodies
 from ncs_jax.scene.step_inputs import step_inputs
 
 
-@pytest.fixture(autouse=True)
-def _plain(plain_jax):
-    yield
-
-
 def turned(cosines, rotation, shift):
     """Normals at these cosines with the outward normal of a garment at x = 0 that looks along x; all is moved together."""
     sines = np.sqrt(1 - np.square(cosines))
@@ -81,7 +76,7 @@ def reaching(a, bend, twist=0.0):
     return jnp.asarray(joint_transforms(body, poses)[0][np.asarray(a.model.source_joints)], jnp.float32)
 
 
-def test_arms_are_beside_a_dress_and_legs_are_not(dress):
+def test_arms_are_beside_a_dress_and_legs_are_not(dress, plain_jax):
     model, body = dress.model, read_body(packaged("body"))
     rest = np.asarray(model.body)[np.asarray(model.beside.skin)]
     number = np.argmin(np.linalg.norm(rest[:, None] - body.vertices[None], axis=-1), axis=1)
@@ -91,7 +86,7 @@ def test_arms_are_beside_a_dress_and_legs_are_not(dress):
     )
 
 
-def test_a_hand_in_a_skirt_pushes_the_skirt_before_it(dress):
+def test_a_hand_in_a_skirt_pushes_the_skirt_before_it(dress, plain_jax):
     """Cloth over the back of a hand is pushed inwards with it, as by its palm: by its own normals it would be pushed out."""
     model = dress.model
     matrices = reaching(dress, 0.75, np.pi)
@@ -122,7 +117,7 @@ def test_a_hand_in_a_skirt_pushes_the_skirt_before_it(dress):
     assert pushed(replace(model, beside=None)) > 0 > pushed(model)
 
 
-def test_many_frames_are_as_each_by_itself(dress):
+def test_many_frames_are_as_each_by_itself(dress, plain_jax):
     model = dress.model
     matrices = jnp.stack([reaching(dress, bend) for bend in (0.0, 0.4, 0.8)])
     every = posed_bodies(model, matrices, 2)
@@ -133,7 +128,7 @@ def test_many_frames_are_as_each_by_itself(dress):
         np.testing.assert_array_equal(step_inputs(model, frame).normals, body_normals(model, body, frame))
 
 
-def test_nothing_is_traced_where_no_skin_is_beside(dress):
+def test_nothing_is_traced_where_no_skin_is_beside(dress, plain_jax):
     model = dress.model
     smooth = replace(model, terms=replace(model.terms, collision="smooth"))
     assert step_inputs(smooth, reaching(dress, 0.0)).normals is None

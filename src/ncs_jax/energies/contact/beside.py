@@ -49,11 +49,13 @@ def turned_inwards(
         normals, body, matrices = pose
         carried, own = blend(matrices, found.blend), body[found.skin]
         cloth = skin(carried, found.points)
-        middle = jnp.mean(cloth, axis=0)
+        middle = jnp.mean(cloth, axis=0, keepdims=True)
         cloth = cloth - middle
         apart = jnp.sum(cloth**2, axis=1)[:, None] - 2 * jnp.matmul(cloth, (own - middle).T, precision="highest")
         rows = jnp.arange(len(cloth), dtype=jnp.int32)[:, None]
-        nearest = jnp.min(jnp.where(apart == jnp.min(apart, axis=0), rows, len(cloth) - 1), axis=0)  # faster than argmin
+        nearest = jnp.min(
+            jnp.where(apart == jnp.min(apart, axis=0, keepdims=True), rows, len(cloth) - 1), axis=0
+        )  # faster than argmin
         outward = jnp.sum(carried[:, :, :3] * found.outward[:, None], axis=-1)
         outward, n = normalize(outward)[nearest], normals[found.skin]
         w = jnp.clip(jnp.sum(n * outward, axis=1, keepdims=True) + 0.5, 0, 1)
