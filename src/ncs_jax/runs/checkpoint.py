@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import json
 import logging
 import os
 import re
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +214,7 @@ class Checkpoints:
                     return ocp.load(folder, shapes, checkpointable_name=NAME)
             except Exception as error:  # Orbax and its store have no common error class
                 reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            _let_go()
             self._check_network(folder, like)
         _stay_quiet()
         mend = "delete this folder to go back to the checkpoint before it"
@@ -291,7 +294,14 @@ def _quiet():
             log.setLevel(level)
 
 
-LATE = ('Error opening "', "Event loop is closed")  # what is said of arrays that were still being read
+def _let_go(seconds: float = 3.0) -> None:
+    """Wait until what else was being read has ended, nearly always: what it says comes as it ends, and as it is collected."""
+    for _ in range(10):
+        gc.collect()
+        time.sleep(seconds / 10)
+
+
+LATE = ('Error opening "', "Event loop is closed", "was never awaited")  # what is said of arrays that were still being read
 
 
 def _stay_quiet() -> None:
