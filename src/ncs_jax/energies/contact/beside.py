@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ncs_jax.energies.contact.nearest import smallest
 from ncs_jax.geometry.numerics import normalize
 from ncs_jax.geometry.skinning import Blend, blend, skin
 
@@ -52,12 +53,8 @@ def turned_inwards(
         middle = jnp.mean(cloth, axis=0, keepdims=True)
         cloth = cloth - middle
         apart = jnp.sum(cloth**2, axis=1)[:, None] - 2 * jnp.matmul(cloth, (own - middle).T, precision="highest")
-        rows = jnp.arange(len(cloth), dtype=jnp.int32)[:, None]
-        nearest = jnp.min(
-            jnp.where(apart == jnp.min(apart, axis=0, keepdims=True), rows, len(cloth) - 1), axis=0
-        )  # faster than argmin
         outward = jnp.sum(carried[:, :, :3] * found.outward[:, None], axis=-1)
-        outward, n = normalize(outward)[nearest], normals[found.skin]
+        outward, n = normalize(outward)[smallest(apart, 1)[0]], normals[found.skin]
         w = jnp.clip(jnp.sum(n * outward, axis=1, keepdims=True) + 0.5, 0, 1)
         return normals.at[found.skin].set(normalize((1 - w) * n - w * outward))
 

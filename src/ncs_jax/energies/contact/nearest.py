@@ -15,7 +15,7 @@ from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.geometry.closest_point import triangle_square
 from ncs_jax.geometry.soa_vectors import dot
 
-__all__ = ["components", "nearest_groups", "nearest_triangle", "nearest_vertex"]
+__all__ = ["components", "nearest_groups", "nearest_triangle", "nearest_vertex", "smallest"]
 
 
 NEAR = 32  # groups of the body's triangles that a group of cloth looks at in a pose of its own
@@ -81,7 +81,7 @@ def _all(x, features, squared, many):
     return _name(_fold(step, _farthest(x[0].shape, x[0].dtype), items, many))
 
 
-def _smallest(values, count):
+def smallest(values, count):
     """Row numbers (count, columns) of the smallest entries of every column.
 
     By `count` passes over the table, which on a CPU is ten times faster than sorting it.
@@ -101,7 +101,7 @@ def nearest_groups(cloth, grouped, count):
     corners = grouped.reshape(len(grouped), -1, 3)
     low, high = corners.min(axis=1), corners.max(axis=1)
     gap = jnp.maximum(jnp.maximum(low[None] - cloth.max(axis=1)[:, None], cloth.min(axis=1)[:, None] - high[None]), 0)
-    return _smallest(jnp.sum(gap * gap, axis=-1).T, min(count, len(grouped))).T
+    return smallest(jnp.sum(gap * gap, axis=-1).T, min(count, len(grouped))).T
 
 
 def _boxes(points):
