@@ -614,3 +614,16 @@ def test_the_tool_compares_no_places_above_joints_that_one_file_lacks(tmp_path, 
         (tmp_path / "x.bvh").write_text(bvh_text(other, path))
         assert check_inputs([str(tmp_path)]) == code
         assert "places not compared, as the files differ below them: Head" in capsys.readouterr().out
+
+
+def test_the_tool_compares_motions_of_the_bodys_own_joints(tmp_path, body, capsys):
+    """No joint of theirs is paired by name, but each is its own: equal ones pass, and a head that is turned does not."""
+    record = io.read_motion(packaged("walk"))
+    poses = record.poses[:FRAMES].copy()
+    told = {"trans": record.translation[:FRAMES], "fps": record.fps, "joint_names": np.array(body.joint_names)}
+    np.savez(tmp_path / "twin.npz", poses=poses, **told)
+    for turn, code in ((0.0, 0), (0.1, 1)):
+        poses[:, body.joint_names.index("Head")] += [0, turn, 0]
+        np.savez(tmp_path / "x.npz", poses=poses, **told)
+        assert check_inputs([str(tmp_path)]) == code
+        assert f"trunk, head, collars, feet {np.degrees(turn):.2f} degrees" in capsys.readouterr().out

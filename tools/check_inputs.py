@@ -112,7 +112,8 @@ def posed(body: BodyRecord, motion: MotionRecord) -> Driven:
             places[:, j] = body.joints[j] + motion.translation
         else:
             places[:, j] = places[:, parent] + turns[:, parent] @ (body.joints[j] - body.joints[parent])
-    return Driven(turns, places, motion.driven, motion.notes)
+    by = motion.driven or dict(zip(body.joint_names, body.joint_names, strict=True))  # of the body's own joints: as it is
+    return Driven(turns, places, by, motion.notes)
 
 
 def apart(one: Driven, other: Driven, body: BodyRecord) -> tuple[float, str, float, str, list[str]]:
@@ -124,12 +125,13 @@ def apart(one: Driven, other: Driven, body: BodyRecord) -> tuple[float, str, flo
     names, frames = body.joint_names, min(len(one.places), len(other.places))
     both = [j for j, n in enumerate(names) if n in one.by and n in other.by]
     alike = [j for j in both if all((names[k] in one.by) == (names[k] in other.by) for k in path_to_root(body.parents, j))]
-    far = np.linalg.norm(one.places[-frames:] - other.places[-frames:], axis=-1).max(axis=0)[alike]
+    far = np.linalg.norm(one.places[-frames:] - other.places[-frames:], axis=-1).max(axis=0)
+    farthest = max(((float(far[j]), names[j]) for j in alike), default=(np.inf, "nothing below the root is driven alike"))
     trunk = [j for j in both if TRUNK.search(names[j])]
     turn = np.swapaxes(one.turns[-frames:, trunk], -1, -2) @ other.turns[-frames:, trunk]
     angle = np.degrees(Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude()).reshape(turn.shape[:2]).max(axis=0)
-    where = names[alike[int(far.argmax())]], names[trunk[int(angle.argmax())]]
-    return float(far.max()), where[0], float(angle.max()), where[1], [names[j] for j in both if j not in alike]
+    most = max(zip(angle.tolist(), (names[j] for j in trunk), strict=True), default=(np.inf, "no part of it in both"))
+    return *farthest, *most, [names[j] for j in both if j not in alike]
 
 
 def limbs_apart(driven: Driven, own: dict[str, np.ndarray], names: tuple[str, ...]) -> tuple[float, str]:
