@@ -347,6 +347,23 @@ def test_another_creature_is_refused_in_few_words(rng):
     assert len(str(told.value)) < 800 and 'joints = { "Body" = ' in str(told.value)
 
 
+def test_a_creature_with_a_trunk_and_no_limbs_of_a_person_is_refused(rng):
+    """Its hips, spine, neck and head have names that are a person's, and none of its legs has."""
+    motion = motion_of("mixamo", rng)
+    keys = figure("mixamo")[3]
+    legs = {"left": "hind_a", "right": "hind_b"}
+    names = [
+        f"{legs[side]}_{j}" if side in legs else n
+        for j, (n, (side, _)) in enumerate(zip(motion.joint_names, keys, strict=True))
+    ]
+    places = np.array(motion.joints)
+    sides = np.array([side in legs for side, _ in keys])
+    places[sides] = 0.3 * rng.normal(size=(sides.sum(), 3))
+    horse = replace(motion, joint_names=tuple(names), joints=places, bones=())
+    with pytest.raises(InputError, match="hips, head and limbs are not found"):
+        retarget(horse, body_of("mixamo"))
+
+
 def test_joints_that_names_do_not_tell_are_told_by_the_scene(rng):
     motion = motion_of("poser", rng)  # without toes nothing says what is ahead, and so which side is which
     foreign = replace(motion, joint_names=tuple(f"bone {j}" for j in range(len(motion.joint_names))))

@@ -373,6 +373,54 @@ def test_a_scene_that_was_changed_in_a_run_is_named(unstarted, tmp_path, plain_j
     assert Checkpoints(out).latest() == 10
 
 
+ALTERED = {  # an array of a file of the scene that was trained, and what is said of it
+    "a vertex of the garment": (
+        "garment",
+        "vertices",
+        r"cloth.npz: garment.file: vertices: the garment .*'up to 1.0 mm elsewhere'",
+    ),
+    "a vertex fewer": ("garment", "faces", r"cloth.npz: garment.file: vertices: the garment .*'29 of them, for 30'"),
+    "the body": ("body", "vertices", r"body.npz: body.file: joints and vertices: the body .*'up to 1.0 mm elsewhere'"),
+    "its joints": ("body", "joints", r"body.npz: body.file: joints and vertices: the body .*'up to 1.0 mm elsewhere'"),
+}
+
+
+@pytest.mark.parametrize("change", ALTERED)
+def test_a_garment_or_body_that_was_changed_since_is_refused(unstarted, tmp_path, plain_jax, change):
+    """By all that opens a run, and by a training that is resumed, before anything is found out of it."""
+    (table, name, match), out = ALTERED[change], tmp_path / "run"
+    shutil.copytree(unstarted, out)
+    facts = read_run(out)
+    file = Path(facts["scene"][table]["file"])
+    arrays = dict(np.load(file))
+    facts["scene"][table]["file"] = str(tmp_path / file.name)
+    write_run(out, facts)
+    for far in (0.00005, 0.00095):  # m, one after the other
+        if name == "faces":
+            arrays["faces"] = arrays["faces"][(arrays["faces"] != 29).all(axis=1)]
+            arrays |= {"vertices": arrays["vertices"][:29], "group_pins": arrays["group_pins"][:4]}
+        else:
+            arrays[name][1] += [far, 0, 0]
+        np.savez(tmp_path / file.name, **arrays)
+        if name != "faces" and far < 1e-4:
+            assert load_run(out).steps == 10
+            continue
+        for go in (load_run, lambda out: train(None, out, steps=20, resume=True)):
+            with pytest.raises(InputError, match=match):
+                go(out)
+
+
+def test_pins_that_were_changed_since_are_refused(unstarted, tmp_path, plain_jax):
+    shutil.copytree(unstarted, out := tmp_path / "run")
+    facts = read_run(out)
+    facts["scene"]["garment"]["pins"] = "pins"
+    write_run(out, facts)
+    with pytest.raises(
+        InputError, match=r"garment.pins: the pins that the run was trained with expected \(found '5 of them, for 0'"
+    ):
+        load_run(out)
+
+
 @pytest.fixture(scope="module")
 def unstarted(tmp_path_factory):
     """A run to begin others from."""

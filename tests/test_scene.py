@@ -70,6 +70,7 @@ def test_packaged_scenes_are_good(name):
         ("[physics]\ndensty = 0.1", ["physics.densty", "unknown key", "density"]),
         ("[phisics]\n", ["phisics", "unknown key", "physics"]),
         ('[physics]\ndensity = "heavy"', ["physics.density", "a number expected", "'heavy'"]),
+        ('[motion]\nfps = "30"', ["motion.fps", "a number expected", "write it without quotes: fps = 30"]),
         ("[physics]\ndensity = -1", ["physics.density", "from 0.0001", "-1"]),
         ("[physics]\ndensity = nan", ["physics.density", "nan"]),
         ('[network]\ncell = "linear"\nstatic = [8, 7]', ["network.static", "[8, 7]", "even"]),

@@ -12,7 +12,7 @@ from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.prepare.joint_shape import limbs_by_shape
 from ncs_jax.prepare.joint_words import EITHER, MIDDLE, ROLES, Name, read_names
 
-__all__ = ["Limbs", "anatomy", "listed", "pair", "propose", "side_and_rest", "undriven"]
+__all__ = ["BONES", "Limbs", "anatomy", "listed", "pair", "propose", "side_and_rest", "undriven"]
 
 BONES = {"arm": "upper arm", "forearm": "forearm", "thigh": "thigh", "shin": "shin", "foot": "foot"}
 ENDS = (("shin", "foot"), ("forearm", "hand"))  # what follows the last long bone of a limb, whatever it is called

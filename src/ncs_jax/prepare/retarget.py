@@ -15,7 +15,7 @@ from ncs_jax.io.character.hierarchy import path_to_root
 from ncs_jax.io.character.smpl import smpl_names, smpl_parents
 from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.records import SkeletonPoses, shown_frames
-from ncs_jax.prepare.joint_names import Limbs, anatomy, listed, pair, propose, undriven
+from ncs_jax.prepare.joint_names import BONES, Limbs, anatomy, listed, pair, propose, undriven
 from ncs_jax.prepare.skeleton import LIMBS, body_axes, bone, forward, least_turn, rest_of, top, up_axis
 
 __all__ = [
@@ -172,7 +172,8 @@ def paired(motion: MotionRecord, body: BodyRecord, joints: Mapping[str, str]) ->
     target = anatomy(called(names, body.bones), body.parents.tolist(), body.joints)
     pairs = _overridden(pair(source, target), motion.joint_names, names, joints)
     source = replace(source, roles=source.roles | {word: pairs[j] for word, j in target.roles.items() if j in pairs})
-    if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)):
+    limbs = {j for role, j in target.roles.items() if role.split()[-1] in BONES}
+    if target.roles["hips"] not in pairs or len(pairs) < min(3, len(names)) or (limbs and limbs.isdisjoint(pairs)):
         ours = [names[target.roles[word]] for word in PAIRED if word in target.roles]
         raise InputError(
             "joints that are a body's by name or shape expected: hips, head and limbs are not found", field="motion.joints",

@@ -20,7 +20,7 @@ from ncs_jax.prepare.garment_checks import check_body_size, check_on_body
 from ncs_jax.prepare.kept import kept
 from ncs_jax.prepare.motion_import import load_motions
 from ncs_jax.prepare.moving_body import check_character, moving_body
-from ncs_jax.prepare.prepared import Prepared, SceneFiles, prepare_scene
+from ncs_jax.prepare.prepared import Prepared, SceneFiles, check_made_from, made_from, prepare_scene
 from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.scene.model import Layer, Model
 from ncs_jax.scene.spec import Scene
@@ -57,18 +57,22 @@ def set_up(
         scene, prepared, below, dtype, report: see `build.build`.
 
     Raises:
-        InputError: a file is unusable, joint counts disagree, units are off, or the garment is not on the body.
+        InputError: a file is unusable or another than that of `prepared`, joint counts disagree, units are off, or the garment
+            is not on the body.
     """
     say = report or (lambda words: None)
     say(f"reading {scene.garment.file} and {scene.body.file}")
     betas = _betas(scene) if prepared is None else prepared.betas
     files = _read(scene, betas, below, dtype)
     motions: dict[str, io.MotionRecord] = {}
-    if prepared is None:
+    if prepared is not None:
+        check_made_from(prepared, files)
+    else:
         scene, motions = load_motions(scene, files.body, say)
         files = replace(files, scene=scene)
         say("preparing the garment")
-        prepared = replace(_prepared(files, [motions[name] for name in scene.motion.files]), betas=betas)
+        prepared = _prepared(files, [motions[name] for name in scene.motion.files])
+        prepared = replace(prepared, betas=betas, **made_from(files))
     model = model_from(files, prepared, dtype)
     automatic = scene.network.cell == "auto"
     scene = cell_of(with_cell(scene), not model.moves or model.terms.pinning or model.body is not None, automatic)

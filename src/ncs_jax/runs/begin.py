@@ -20,6 +20,7 @@ from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.prepare.build import SWING, Assembly, check_terms, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
+from ncs_jax.prepare.setting import set_up
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
 from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
@@ -51,9 +52,12 @@ def assemble_run(
     """
     if start is not None:
         return _assemble_started(start, scene, network, functools.partial(make_ready, ahead=None))
-    assembly = make_ready(scene)
-    if facts is not None and out is not None and (out / "prepared.npz").exists():  # of what it has learned: not found anew
+    kept = None
+    if facts is not None and out is not None and (out / "prepared.npz").exists():
         kept = read_prepared(out)
+        set_up(replace(scene, garment=replace(scene.garment, over=())), prepared=kept)  # refuses files that were changed since
+    assembly = make_ready(scene)
+    if kept is not None and out is not None:  # what it has learned is not found anew
         _check_prepared(out, kept, assembly.prepared)
         assembly = _with_fields_of(kept, assembly)
     return assembly, None

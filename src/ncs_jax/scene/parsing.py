@@ -122,7 +122,9 @@ def checked_value(kind, value, meta, source, where):
     }
     if not good[kind]:
         names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-        raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value)
+        quoted = isinstance(value, str) and kind is not bool and re.fullmatch(r"[-+.\de]+", value.strip())
+        mend = f"write it without quotes: {where.rsplit('.', 1)[-1]} = {value.strip()}" if quoted else None
+        raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value, mend=mend)
     if meta["choices"] and value not in meta["choices"]:
         raise InputError(f"one of {', '.join(meta['choices'])} expected", file=source, field=where, value=value)
     if kind in (int, float):

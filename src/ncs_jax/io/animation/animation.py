@@ -16,7 +16,7 @@ from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
 from ncs_jax.io.mesh.usd import USD, check_installed, read_usd_animation, write_usd
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
-from ncs_jax.io.tables.files import check_place, replacing
+from ncs_jax.io.tables.files import check_place, replacing, suffix_lacking
 from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices
@@ -159,7 +159,7 @@ def read_animation(path: str | Path, *, faces: ArrayLike | None = None, fps: flo
         rate = table.number("fps") if fps is None or "fps" in table else rate
     else:
         mend = "write it as one of these too" if suffix in FORMATS else "convert it"
-        raise InputError(f"one of {', '.join(READABLE)} expected", file=path, value=suffix or "no suffix", mend=mend)
+        raise InputError(f"one of {', '.join(READABLE)} expected", file=path, value=suffix or suffix_lacking(path), mend=mend)
     x = floats(file, "vertices", x, ("T", "V", 3), ("frame", "vertex")).astype(np.float32, copy=False)
     if 0 in x.shape:
         raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)

@@ -13,7 +13,7 @@ from ncs_jax.io.character.gltf_character import gltf_body
 from ncs_jax.io.character.smpl_model import pickle_refused, smpl_directions, smpl_fields, smpl_table
 from ncs_jax.io.packaged import resolved
 from ncs_jax.io.records import BodyRecord
-from ncs_jax.io.tables.files import LARGEST
+from ncs_jax.io.tables.files import LARGEST, suffix_lacking
 from ncs_jax.io.tables.npz import read_npz
 from ncs_jax.io.tables.table import Table, checked_parents, indices, normalised_weights
 
@@ -74,7 +74,7 @@ def read_body(
             mend += "garment, and the body is ncs:body or a character; else rig it, as in Mixamo, and export .glb or .fbx"
         raise InputError(
             f"a character with skeleton and skinning weights expected, {', '.join(FORMATS)}", file=path, field="body.file",
-            value=suffix or "no suffix", mend=mend,
+            value=suffix or suffix_lacking(path), mend=mend,
         )  # fmt: skip
     table = read_npz(path, {*FIELDS, *smpl_fields(len(betas) > 0, correctives)}.__contains__)
     if "v_template" in table:

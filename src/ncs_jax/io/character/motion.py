@@ -15,6 +15,7 @@ from ncs_jax.io.character.moving_root import bvh_from_moving_root
 from ncs_jax.io.character.rig_motion import split_clip
 from ncs_jax.io.packaged import resolved
 from ncs_jax.io.records import MotionRecord
+from ncs_jax.io.tables.files import suffix_lacking
 from ncs_jax.io.tables.hdf5 import read_hdf5
 from ncs_jax.io.tables.npz import read_npz
 from ncs_jax.io.tables.table import select
@@ -60,7 +61,8 @@ def read_motion(
     name, clip = split_clip(resolved(path))
     if (suffix := Path(name).suffix.lower()) not in FORMATS:
         mend = "load it where it was made and write an .npz of poses, trans and fps" if suffix in PICKLED else "convert it"
-        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix", mend=mend)
+        mend = "name one of its files" if Path(name).is_dir() else mend
+        raise InputError(f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or suffix_lacking(name), mend=mend)
     if not 0 < scale < 1e6:
         raise InputError("a number above 0 expected", file=path, field="scale", value=scale)
     if suffix in TABLES:

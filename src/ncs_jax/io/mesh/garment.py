@@ -20,6 +20,7 @@ from ncs_jax.io.mesh.usd import USD, read_usd_mesh
 from ncs_jax.io.mesh.weld import weld as same_places
 from ncs_jax.io.packaged import resolved
 from ncs_jax.io.records import GarmentRecord
+from ncs_jax.io.tables.files import suffix_lacking
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices, normalised_weights
 
@@ -103,7 +104,7 @@ def raw_mesh(path: str | Path, mesh: tuple[str, ...]) -> RawGarment:
         return OBJECTS[suffix](path, mesh)
     if suffix not in FORMATS:
         raise InputError(
-            f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or "no suffix",
+            f"one of {', '.join(FORMATS)} expected", file=path, value=suffix or suffix_lacking(path),
             mend="export the garment as one of them",
         )  # fmt: skip
     if mesh:

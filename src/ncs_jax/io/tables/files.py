@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ncs_jax.errors import InputError
 
-__all__ = ["LARGEST", "check_place", "decoded", "readable", "reading", "replacing", "text_of", "unpackable"]
+__all__ = ["LARGEST", "check_place", "decoded", "readable", "reading", "replacing", "suffix_lacking", "text_of", "unpackable"]
 
 LARGEST = 4 * 2**30  # bytes; no array or text of a file may need more
 PACKING = 1100  # deflate packs at most 1032 to 1: a header that promises more than the file can hold is wrong
@@ -64,6 +64,11 @@ def reading(file: Path, kind: str) -> Iterator[None]:
             file=file,
             mend="the file is damaged or of another format; write it again",
         ) from None
+
+
+def suffix_lacking(path: str | Path) -> str:
+    """Return what a path without a suffix is, in the words of an error."""
+    return "a folder" if Path(path).is_dir() else "no suffix"
 
 
 def text_of(path: str | Path) -> tuple[Path, str]:
