@@ -776,7 +776,7 @@ def test_damaged_pc2(tmp_path, data, message):
 def test_missing_files_and_folders(tmp_path, read):
     for path, message in (
         (tmp_path / "none.npz", "no such file"),
-        (tmp_path, "a file expected|no suffix"),
+        (tmp_path, "a file expected|found .a folder"),
         (tmp_path / "a\0b.npz", "no such file"),
     ):
         with pytest.raises(InputError, match=message):
