@@ -20,13 +20,13 @@ import pytest
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.rollout import stepper
 from ncs_jax.runs import train as runs_train
-from ncs_jax.runs.begin import assemble_run
+from ncs_jax.runs.begin import assemble_run, resumed_scene
 from ncs_jax.runs.checkpoint import Checkpoints, read_run, write_run
 from ncs_jax.runs.plan import EARLY, Costs, Minutes, steps_within
 from ncs_jax.runs.pose_stiffness import poses_of
 from ncs_jax.runs.run import Run, assemble, load_run
 from ncs_jax.runs.train import train
-from ncs_jax.scene.spec import load_scene
+from ncs_jax.scene.spec import PRESETS, load_scene
 from ncs_jax.training.devices import free_memory
 from ncs_jax.training.step import initial_state
 
@@ -339,6 +339,22 @@ def test_a_run_goes_on_with_its_own_scene_and_its_preset(tmp_path, plain_jax, re
     assert train(scene, out, steps=10, resume=True).steps == 10  # the preset is not given again
     assert train(None, out, steps=20, resume=True).steps == 20
     assert not [w for w in recwarn if issubclass(w.category, InputWarning)]
+
+
+def test_another_network_than_the_default_that_a_run_has_is_refused(tmp_path, recwarn):
+    """Though a preset has the default's sizes. A run that began with a preset goes on with the scene that it was put on."""
+    write_scene(tmp_path)
+    file, out = tmp_path / "plain.toml", tmp_path / "run"
+    file.write_text('[body]\nfile = "body.npz"\n[garment]\nfile = "cloth.npz"\n[motion]\nfiles = ["swing.npz"]\n')
+    plain = load_scene(file)
+    for preset in (None, *PRESETS):
+        write_run(out, {"steps": 40, "seed": 0, "scene": load_scene(file, preset).to_dict()})
+        assert resumed_scene(read_run(out), out, plain, None, None).network == load_scene(file, preset).network
+    assert not [w for w in recwarn if issubclass(w.category, InputWarning)]
+    write_run(out, {"steps": 40, "seed": 0, "scene": plain.to_dict()})
+    other = replace(plain, network=replace(plain.network, decoder=(64,)))
+    with pytest.raises(InputError, match=r"network.decoder: the scene of .*run expected, where it is \[256, 256, 256\] .*64"):
+        resumed_scene(read_run(out), out, other, None, None)
 
 
 def test_a_folder_of_motions_may_grow_before_a_run_is_resumed(tmp_path, plain_jax):

@@ -143,7 +143,7 @@ def _check_same_scene(facts: dict, out: Path, kept: Scene, scene: Scene) -> None
     chosen = {"body.joints"} if facts.get("start") else set()  # by `_assemble_started`
     chosen |= {"network.cell"} if scene.network.cell == "auto" else set()
     tables = kept.to_dict(), scene.to_dict()
-    by_preset = [{table: tables[1][table] | values for table, values in preset.items()} for preset in ({}, *PRESETS.values())]
+    by_preset = [{table: tables[1][table] | values for table, values in preset.items()} for preset in ({}, *_no_defaults())]
     each = [[d for d in _differences(tables[0], tables[1] | preset) if d[0] not in chosen] for preset in by_preset]
     other = min(each, key=len)  # of a run that began with --preset, which is not given again
     lists = {"motion.files", "motion.validation"} if scene.motion.found or scene.motion.broken == "skip" else set()
@@ -157,6 +157,16 @@ def _check_same_scene(facts: dict, out: Path, kept: Scene, scene: Scene) -> None
     if other:
         what = f"{out} keeps the scene that it began with; given otherwise now, and not taken: {', '.join(d[0] for d in other)}"
         warnings.warn(f"{what}; a new run can begin from its weights: --from {out}", category=InputWarning, stacklevel=4)
+
+
+def _no_defaults() -> list[dict[str, dict]]:
+    """Return the presets without what is a field's default, which would hide that a scene has something of its own there."""
+    plain = Scene().to_dict()
+
+    def told(table: str, values: dict) -> dict:
+        return {name: value for name, value in values.items() if value != plain[table][name]}
+
+    return [{table: told(table, values) for table, values in preset.items()} for preset in PRESETS.values()]
 
 
 def _differences(kept: dict, given: dict, where: str = "") -> Iterator[tuple[str, Any, Any]]:
