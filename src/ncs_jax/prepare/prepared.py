@@ -49,7 +49,7 @@ class Prepared:
     they turn and strain the garment (modes, modes), by_pose: how stiff it is along them in a pose, and drape: how it hangs in
     the first one (verts, 3), m, see `RitzModes`. A scene whose network does not swing has no vibrations. betas: the shape of an
     SMPL body. pieces: into how many contact cuts the edges of each triangle (faces,), see `contact_detail.pieces_of`; none
-    where all are whole. rest, pins, skin: of the files that all this is of, see `made_from`.
+    where all are whole. rest, faces, pins, skin, skin_faces: of the files that all this is of, see `made_from`.
     """
 
     inputs: np.ndarray
@@ -65,43 +65,59 @@ class Prepared:
     betas: np.ndarray = field(default_factory=lambda: np.zeros(0))
     pieces: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
     rest: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     pins: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     skin: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    skin_faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
 
 def made_from(files: SceneFiles) -> dict[str, np.ndarray]:
-    """Return what tells whether files are the same later: the garment's vertices (verts, 3), its pins, and the body's joints
-    with some of its vertices (J + `SAMPLES` at most, 3), m."""
-    body, skin = files.body, np.zeros((0, 3))
+    """Return what tells whether files are the same later: the garment's vertices (verts, 3) in m, triangles and pins, and the
+    body's joints with some of its vertices (J + `SAMPLES` at most, 3) in m, and its triangles."""
+    garment, body = files.garment, files.body
+    skin, skin_faces = np.zeros((0, 3)), np.zeros((0, 3))
     if body is not None:
         some = np.linspace(0, len(body.vertices) - 1, min(SAMPLES, len(body.vertices))).astype(int)
-        skin = np.concatenate([body.joints, body.vertices[some]])
-    return {"rest": files.garment.vertices.astype(np.float32), "pins": np.asarray(files.pins), "skin": skin.astype(np.float32)}
+        skin, skin_faces = np.concatenate([body.joints, body.vertices[some]]), body.faces
+    return {
+        "rest": garment.vertices.astype(np.float32),
+        "faces": garment.faces.astype(np.int32),
+        "pins": np.asarray(files.pins),
+        "skin": skin.astype(np.float32),
+        "skin_faces": skin_faces.astype(np.int32),
+    }
 
 
 def check_made_from(prepared: Prepared, files: SceneFiles) -> None:
     """See that the files of a scene are still those that a run was trained on, to `ALIKE`.
 
     Raises:
-        InputError: the garment, its pins or the body are others. A run of an earlier version does not know.
+        InputError: the garment, its pins or the body are others. A run of an earlier version knows less, or nothing.
     """
     if not len(prepared.rest):
         return
     scene, found = files.scene, made_from(files)
     whole = scene.path(scene.garment.file), scene.path(scene.body.file)
-    for name, file, field_, what in (
+    compared = [
         ("rest", whole[0], "garment.file: vertices", "garment"),
         ("pins", whole[0], "garment.pins", "pins"),
         ("skin", whole[1], "body.file: joints and vertices", "body"),
-    ):
+    ]
+    if len(prepared.faces):
+        compared += [
+            ("faces", whole[0], "garment.file: faces", "garment"),
+            ("skin_faces", whole[1], "body.file: faces", "body"),
+        ]
+    for name, file, field_, what in compared:
         kept, now = getattr(prepared, name), found[name]
         if kept.shape != now.shape:
             told = f"{len(now)} of them, for {len(kept)}"
-        elif name == "pins":
-            told = "" if np.array_equal(kept, now) else "others"
-        else:
+        elif kept.dtype.kind == "f":
             far = float(np.linalg.norm(kept.astype(np.float64) - now, axis=1).max(initial=0))
             told = f"up to {1000 * far:.1f} mm elsewhere" if far > ALIKE else ""
+        else:
+            others = int(np.sum(np.any(kept != now, axis=-1))) if kept.ndim > 1 else int(np.sum(kept != now))
+            told = f"{others} others of {len(kept)}" if others else ""
         if told:
             raise InputError(
                 f"the {what} that the run was trained with expected", file=file, field=field_, value=told,
