@@ -3,7 +3,8 @@
     python -m experiments.augmentation [SCENE] [--steps 2000] [--unseen ncs:mixed ncs:walk_turn_stop] [--quick]
 
 `training.motion_augmentation` is the share of a batch that has another window's dynamic code on its static code;
-`motion.mirror` adds every motion in a mirror. Writes augmentation.csv, .md and .png.
+`motion.mirror` adds every motion in a mirror; `training.recombined` is the share in poses put together of the motions' limbs.
+Writes augmentation.csv, .md and .png.
 """
 
 from __future__ import annotations
@@ -16,16 +17,22 @@ from pathlib import Path
 from experiments.study import COLUMNS, bars, changed, command, networks, without, write
 from ncs_jax import Scene
 
-# Share of a batch with another window's motion, and whether mirrored motions are added.
-CHOICES = {"none": (0.0, False), "motion": (0.5, False), "mirror": (0.0, True), "both": (0.5, True)}
+# Share of a batch with another window's motion, whether mirrored motions are added, and the share in recombined poses.
+CHOICES = {
+    "none": (0.0, False, 0.0),
+    "motion": (0.5, False, 0.0),
+    "mirror": (0.0, True, 0.0),
+    "recombined": (0.0, False, 0.3),
+    "all": (0.5, True, 0.3),
+}
 
 
 def experiment(scene: Scene, unseen: Sequence[str], steps: int, out: Path, kept: Path) -> list[dict]:
     """Measure all, write the table and the picture into `out`, and return the rows."""
     scene = without(scene, unseen)
     scenes = {
-        name: changed(scene, training={"motion_augmentation": share}, motion={"mirror": mirrored})
-        for name, (share, mirrored) in CHOICES.items()
+        name: changed(scene, training={"motion_augmentation": share, "recombined": poses}, motion={"mirror": mirrored})
+        for name, (share, mirrored, poses) in CHOICES.items()
     }
     rows = networks(scenes, unseen, steps, kept, "augmentation")
     write(out, "augmentation", rows, {"augmentation": "", **COLUMNS})

@@ -296,8 +296,8 @@ def test_spread(alone, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_augmentation(alone, tmp_path):
     rows = studied(augmentation, tmp_path)
-    assert list(rows) == ["none", "motion", "mirror", "both"]
-    assert len({row["total"] for row in rows.values()}) == 4
+    assert list(rows) == ["none", "motion", "mirror", "recombined", "all"]
+    assert len({row["total"] for row in rows.values()}) == 5
 
 
 @pytest.mark.slow

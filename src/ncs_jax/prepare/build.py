@@ -277,20 +277,21 @@ def vibrations_of(prepared: Prepared, dtype) -> RitzModes:
     return RitzModes(jnp.asarray(prepared.vibrations, dtype), jnp.asarray(prepared.energy, dtype), *found)
 
 
-def features_from_records(model: Model, *records: io.MotionRecord) -> MotionFeatures:
+def features_from_records(model: Model, *records: io.MotionRecord, apart: bool = False) -> MotionFeatures:
     """Return descriptors and transforms of motions that are at the model's frame rate, end to end.
 
-    Each motion is measured from the corner, nearest to where it begins, of a grid of `CELL` m.
+    Each motion is measured from the corner, nearest to where it begins, of a grid of `CELL` m. apart: in each frame the
+    character stands still, as in a motion of its own.
     """
     dtype = model.skeleton.joints.dtype
     lengths = [len(r.poses) for r in records]
-    start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+    start = np.arange(sum(lengths)) if apart else np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
     poses = np.concatenate([r.poses for r in records])
     origins = [CELL * np.round(r.translation[0].astype(np.float64) / CELL) for r in records]
     near = np.concatenate([r.translation - origin for r, origin in zip(records, origins, strict=True)])
     found = _in_parts(model, poses.astype(dtype), near.astype(dtype), start.astype(np.int32))
     if model.under:
-        layers = jnp.concatenate([_layer_transforms(layer, records, origins, dtype) for layer in model.under], axis=1)
+        layers = jnp.concatenate([_layer_transforms(layer, records, origins, dtype, apart) for layer in model.under], axis=1)
         found = replace(found, matrices=jnp.concatenate([found.matrices, layers], axis=1))
     return replace(found, origin=jnp.asarray(np.repeat(origins, lengths, axis=0), dtype)) if np.any(origins) else found
 
@@ -311,10 +312,10 @@ def _in_parts(model: Model, poses: np.ndarray, translation: np.ndarray, start: n
     return MotionFeatures(static, dynamic, matrices, jnp.asarray(start))
 
 
-def _layer_transforms(layer: Layer, records, origins, dtype) -> Float[Array, "frames verts 3 4"]:
+def _layer_transforms(layer: Layer, records, origins, dtype, apart: bool) -> Float[Array, "frames verts 3 4"]:
     """Return what takes each vertex of a garment below from its rest to its place, measured from the motions' origins."""
     x = [
-        animated(layer.model, layer.network, layer.params, features_from_records(layer.model, record)) - origin
+        animated(layer.model, layer.network, layer.params, features_from_records(layer.model, record, apart=apart)) - origin
         for record, origin in zip(records, origins, strict=True)
     ]
     offsets = jnp.asarray(np.concatenate(x), dtype) - layer.rest

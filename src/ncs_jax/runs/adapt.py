@@ -220,7 +220,8 @@ def _scene_on(run: Run, motions: str | Sequence[str]) -> tuple[Scene, dict[str, 
         records[whole] = run.motion(name)
         own |= {whole: settings} if (settings := scene.own_settings(name if name in scene.motions else whole)) else {}
     motion = replace(scene.motion, files=tuple(records), validation=(), mirror=False, own=own)
-    training = replace(scene.training, motion_augmentation=min(AUGMENTED, scene.training.motion_augmentation))
+    augmented = min(AUGMENTED, scene.training.motion_augmentation)
+    training = replace(scene.training, motion_augmentation=augmented, recombined=0.0)
     return replace(scene, motion=motion, training=training), records
 
 

@@ -17,10 +17,12 @@ from jaxtyping import Array
 
 from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.errors import required
+from ncs_jax.io.records import MotionRecord
 from ncs_jax.network.methods.method import Method
 from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animate
-from ncs_jax.prepare.build import Assembly
+from ncs_jax.prepare.build import Assembly, features_from_records
+from ncs_jax.prepare.recombination import Recombination, recombination_of, recombined
 from ncs_jax.runs.pose_stiffness import find_stiffness, learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
@@ -35,6 +37,7 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
+POOL = 512  # poses put together of the motions' limbs, others after every checkpoint, where a scene trains on any
 FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
 
@@ -42,7 +45,7 @@ class PlacedScene:
     """A scene made ready, on every device that trains it, and the programs that train it there.
 
     `model` and `features` are this process's own copies. They hold the same numbers as those on the devices. Of many motions
-    they are a share, another one after every checkpoint: see `training.shares`.
+    they are a share, another one after every checkpoint: see `training.shares`. `POOL` recombined poses come last, if any.
     """
 
     def __init__(self, assembly: Assembly, seed: int, programs: Programs | None = None):
@@ -54,6 +57,8 @@ class PlacedScene:
         self._compiled: dict[int, Compiled] = {}
         self._every, self._number = whole_chunks(spec.checkpoint_every), -1  # steps that a share is trained on, and which it is
         self._weight: np.ndarray | None = None  # of the frames, where some are trained on more
+        self._recombination = _recombination(assembly)
+        self._motions: MotionFeatures  # without poses that are no motion's
         self.features: MotionFeatures
         self._everywhere: Any  # the model and the features, with bodies
         self._show(0)
@@ -105,6 +110,8 @@ class PlacedScene:
 
     def _named(self, frame: int) -> str:
         """Return in words which frame of which file a frame of a share is; nothing where there are no shares."""
+        if frame >= len(self._motions.start):
+            return " (that is a recombined pose)"
         files = self.assembly.scene.motion.files
         for piece in self._pieces:
             if frame < piece.stop - piece.first:
@@ -117,7 +124,8 @@ class PlacedScene:
         """Take the motions that are trained on from a step on, and what the network adds to them: see `Method.refresh`."""
         self._show(step // self._every)
         if self.assembly.network.refreshes:
-            told = refreshed(self.assembly.network, params, self.model, self._bare)
+            told = refreshed(self.assembly.network, params, self.model, self._motions)
+            told = {name: _and_still(array, len(self._bare.start)) for name, array in told.items()}
             model, features = self._everywhere
             self.features = replace(self.features, **told)
             self._everywhere = model, replace(features, **self.copied(told))
@@ -138,7 +146,7 @@ class PlacedScene:
 
     def learn_pose_stiffness(self, params: dict, done: int, steps: int) -> bool:
         """Find how stiff the garment is in poses, after `done` of `steps`: see `runs.pose_stiffness`. Return if it is known."""
-        learned = learn_pose_stiffness(self.assembly, params, self._bare, steps, self.seed)
+        learned = learn_pose_stiffness(self.assembly, params, self._motions, steps, self.seed)
         if learned is self.assembly:
             return False
         self.assembly, self.model = learned, replace(self.model, vibrations=learned.model.vibrations)
@@ -165,17 +173,21 @@ class PlacedScene:
         self._everywhere = self.copied(self.model), self._everywhere[1]
 
     def _show(self, number: int) -> None:
-        """Place the motions of a share, or all of them where they are few."""
-        training, spec = required(self.assembly.training, "training"), self.assembly.scene.training
-        if number == self._number or (training.shares is None and self._number >= 0):
+        """Place the motions of a share, or all of them where they are few, and recombined poses."""
+        training, spec, begun = required(self.assembly.training, "training"), self.assembly.scene.training, self._number >= 0
+        if number == self._number or (begun and training.shares is None and self._recombination is None):
             return
-        self._weight = None  # of other frames
+        self._everywhere = None  # before the next one takes as much memory
         self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
-        if training.shares is None:
-            self._bare, self._last = self.assembly.track, np.arange(len(self.assembly.track.start))
-        else:
-            self._everywhere = None  # before the next one takes as much memory
-            self._bare, self._last = training.features(self.assembly.model, self._pieces)
+        if training.shares is not None:
+            self._weight = None  # of other frames
+            self._motions, self._last = training.features(self.assembly.model, self._pieces)
+        elif not begun:
+            self._motions, self._last = self.assembly.track, np.arange(len(self.assembly.track.start))
+        self._bare = self._motions
+        if self._recombination is not None:
+            poses = recombined(self._recombination, POOL, [self.seed, 5, number])
+            self._bare = _joined(self._motions, _standing(self.assembly.model, poses))
         self.features = self._bare
         self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
 
@@ -185,8 +197,13 @@ class PlacedScene:
         if required(self.assembly.training, "training").shares is not None:
             seed, first = int(np.random.SeedSequence([seed, 3, self._number]).generate_state(1)[0]), first % self._every
         ends = self._last[batches(len(self._last), batch, seed, first, count)].astype(np.int32)
-        share = self.assembly.scene.training.focus
-        return ends if self._weight is None else focused(ends, self._last, self._weight, share, seed, first)
+        spec = self.assembly.scene.training
+        if self._weight is not None:
+            ends = focused(ends, self._last, self._weight, spec.focus, seed, first)
+        if self._recombination is not None:
+            pool = len(self._motions.start) + np.arange(POOL, dtype=np.int32)
+            ends = focused(ends, pool, np.ones(POOL), spec.recombined, seed, first, stream=6)
+        return ends
 
     def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
         ends = self._ends(first, count)
@@ -213,7 +230,13 @@ def begin_programs(programs: Programs, assembly: Assembly, count: int) -> None:
     if batch_mesh(batch) is not None:
         return
 
+    more = _recombines(assembly)
+
     def shapes(model: Model, track: MotionFeatures) -> list[list[Array]]:
+        if more:
+            track = _joined(
+                track, jax.tree.map(lambda a: jnp.zeros((POOL, *a.shape[1:]), a.dtype), replace(track, origin=None))
+            )
         state, placed, ends = (
             initial_state(model, network, 0),
             with_bodies(model, track, batch),
@@ -235,6 +258,37 @@ def _functions(assembly: Assembly, mesh: Mesh | None) -> tuple[Callable, Callabl
     """Return what is compiled: a chunk of steps, and `training_metrics` of model, parameters, motions and frames."""
     network, spec = assembly.network, assembly.scene.training
     return chunk_runner(network, spec, mesh), lambda model, *given: training_metrics(model, network, spec.window, *given)
+
+
+def _recombines(assembly: Assembly) -> bool:
+    """Tell whether a scene trains on recombined poses, and has motions to make them of."""
+    scene = assembly.scene
+    return bool(scene.training.recombined and scene.motion.files) and assembly.body is not None
+
+
+def _recombination(assembly: Assembly) -> Recombination | None:
+    """Return what poses are put together from; None where a scene trains on none."""
+    body, training = assembly.body, assembly.training
+    return recombination_of(body, training.records) if body and training and _recombines(assembly) else None
+
+
+def _standing(model: Model, poses: np.ndarray) -> MotionFeatures:
+    """Return a character that stands in each of the poses (poses, joints, 3)."""
+    return features_from_records(model, MotionRecord(poses, np.zeros_like(poses[:, 0]), model.fps), apart=True)
+
+
+def _joined(motions: MotionFeatures, more: MotionFeatures) -> MotionFeatures:
+    """Return motions and, behind them, others that are measured from the world's origin."""
+    count, origin = len(motions.start), motions.origin
+    more = replace(
+        more, start=more.start + count, origin=None if origin is None else jnp.zeros((len(more.start), 3), origin.dtype)
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), motions, more)
+
+
+def _and_still(array: Array, frames: int) -> Array:
+    """Return what a network adds to motions, and none of it in the other frames."""
+    return jnp.pad(array, [(0, frames - len(array))] + [(0, 0)] * (array.ndim - 1))
 
 
 @functools.partial(jax.jit, static_argnums=1)

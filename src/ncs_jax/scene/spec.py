@@ -212,6 +212,7 @@ class TrainingSpec:
     window: int = _f(11, "frames in a window; with inertia at least 3 are taken", low=1, high=10000)
     learning_rate: float = _f(1e-3, "Adam's peak step size", low=0, high=1, above=True)
     motion_augmentation: float = _f(0.0, "share of a batch that gets another window's motion", low=0, high=1)
+    recombined: float = _f(0.0, "share of a batch in poses put together of the motions' limbs", low=0, high=0.9)
     focus: float = _f(0.0, "share of a batch from the frames in which contact costs most", low=0, high=0.9)
     validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)
     checkpoint_every: int = _f(200, "steps between checkpoints", low=1, high=10_000_000)

@@ -24,14 +24,17 @@ def batches(frames: int, batch: int, seed: int, first: int, count: int) -> np.nd
     return picked.reshape(count, batch).astype(np.int32)
 
 
-def focused(ends: np.ndarray, last: np.ndarray, weight: np.ndarray, share: float, seed: int, first: int) -> np.ndarray:
+def focused(
+    ends: np.ndarray, last: np.ndarray, weight: np.ndarray, share: float, seed: int, first: int, stream: int = 4
+) -> np.ndarray:
     """Return the last frames of the windows of some steps (count, batch), a share of which are drawn anew by their weight.
 
-    A pure function of its arguments, as `batches`. last, weight: (frames,) all of these frames, and how likely each is.
+    A pure function of its arguments, as `batches`. last, weight: (frames,) all of these frames, and how likely each is. stream:
+    of random numbers; another one where others are drawn anew.
     """
     found, many = ends.copy(), round(share * ends.shape[1])
     for i, row in enumerate(found):
-        rng = np.random.default_rng([seed, 4, first + i])
+        rng = np.random.default_rng([seed, stream, first + i])
         row[rng.permutation(len(row))[:many]] = rng.choice(last, many, p=weight / weight.sum())
     return found
 

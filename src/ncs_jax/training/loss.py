@@ -20,7 +20,7 @@ from ncs_jax.scene.step_inputs import Past, step_inputs
 __all__ = ["gradients", "physics", "with_bodies"]
 
 
-BODIES = 1 << 28  # bytes of posed bodies that are kept, at most
+BODIES = 3 << 27  # bytes of posed bodies that are kept, at most
 
 
 def with_bodies(model: Model, track: MotionFeatures, batch: int) -> MotionFeatures:
