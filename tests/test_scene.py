@@ -16,7 +16,7 @@ def write(folder, text):
 
 
 def test_everything_has_a_default(tmp_path):
-    assert load_scene(write(tmp_path, "")).to_dict() == Scene().to_dict()
+    assert load_scene(write(tmp_path, "[garment]\n")).to_dict() == Scene().to_dict()
 
 
 def test_a_scene_survives_its_own_tables(tmp_path):
@@ -44,7 +44,7 @@ def test_a_preset_takes_the_place_of_the_scenes_own_values(tmp_path):
         assert scene.network.decoder == tables["network"]["decoder"] and scene.training.batch == 5
         assert scene.network.joint == (9,) and scene.training.steps == tables["training"]["steps"]
     assert load_scene(path).network.decoder == (7,)
-    assert load_scene(write(tmp_path, ""), "balanced").to_dict() == Scene().to_dict()
+    assert load_scene(write(tmp_path, "[garment]\n"), "balanced").to_dict() == Scene().to_dict()
     with pytest.raises(InputError, match="a table expected"):
         load_scene(write(tmp_path, "network = 3"), "fast")
     with pytest.raises(InputError, match=r"preset: one of fast, balanced, accurate expected .found 'quick'"):
@@ -91,6 +91,8 @@ def test_packaged_scenes_are_good(name):
         ("[physics]\ndensity = 15000", ["15000 g/m^2 are 15 kg/m^2"]),
         ('[garment]\nfile = ""', ["garment.file", "a garment is needed"]),
         ("[physics", ["not TOML"]),
+        ("# only a comment", ["a scene expected", "an empty file", "[garment]"]),
+        ('[motions]\nfiles = ["ncs:walk"]', ["motions: unknown key (found 'a table')", "did you mean motion?"]),
     ],
 )
 def test_one_error_names_file_field_value_and_mend(tmp_path, text, words):
@@ -111,6 +113,7 @@ WRITTEN = {
     "an escape that it has": (r'file = "C:\temp\new.obj"', "garment.file: a text without tabs"),
     "in a list": (r'mesh = ["Dress", "a\b"]', "garment.mesh[1]: a text without tabs"),
     "no quotes": ("file = dress.obj  # mine", 'text stands in quotes: file = "dress.obj"'),
+    "a comma": ("weld = 0,002  # 2 mm", "a number has a point, no comma: weld = 0.002"),
     "something else": ("file = [", "correct that line"),
 }
 

@@ -20,6 +20,7 @@ SINGLE = "or put the path in single quotes"
 BACKSLASHES = r"\\+"
 BACKSLASH = re.compile(r'"[^"]*\\[^"]*"')
 UNQUOTED = re.compile(r"\s*(?P<key>[\w.-]+)\s*=\s*(?P<value>(?!true\b|false\b)[A-Za-z_./~][^\"'#]*?)\s*(?:#.*)?")
+COMMA = re.compile(r"\s*(?P<key>[\w.-]+)\s*=\s*(?P<whole>[-+]?\d+),(?P<part>\d+)\s*(?:#.*)?")
 
 
 def read_toml(file: Path) -> dict:
@@ -55,6 +56,8 @@ def _not_toml(file: Path, text: str, error: tomllib.TOMLDecodeError) -> InputErr
         mend = f"a backslash in double quotes begins a sign: write {re.sub(BACKSLASHES, '/', path[0])}, {SINGLE}"
     elif line and (bare := UNQUOTED.fullmatch(line)):
         mend = f'text stands in quotes: {bare["key"]} = "{bare["value"]}"'
+    elif line and (number := COMMA.fullmatch(line)):
+        mend = f"a number has a point, no comma: {number['key']} = {number['whole']}.{number['part']}"
     return InputError(f"not TOML: {error}: {line[:80]}" if line else f"not TOML: {error}", file=file, mend=mend)
 
 
@@ -82,7 +85,8 @@ def parse_table(cls, tables, source: str, where: str):
         if key not in fields:
             near = next(iter(difflib.get_close_matches(key, list(fields), n=1)), "")
             mend = f"did you mean {near}?" if near else f"the fields here are {', '.join(fields)}"
-            raise InputError("unknown key", file=source, field=f"{where}.{key}".lstrip("."), value=tables[key], mend=mend)
+            value = "a table" if isinstance(tables[key], dict) else tables[key]
+            raise InputError("unknown key", file=source, field=f"{where}.{key}".lstrip("."), value=value, mend=mend)
     values = {}
     for name, f in fields.items():
         if name in tables:
@@ -122,7 +126,7 @@ def checked_value(kind, value, meta, source, where):
     }
     if not good[kind]:
         names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-        quoted = isinstance(value, str) and kind is not bool and re.fullmatch(r"[-+.\de]+", value.strip())
+        quoted = isinstance(value, str) and kind is not bool and re.fullmatch(r"[-+.]*\d[-+.\de]*", value.strip())
         mend = f"write it without quotes: {where.rsplit('.', 1)[-1]} = {value.strip()}" if quoted else None
         raise InputError(f"{names[kind]} expected ({meta['help']})", file=source, field=where, value=value, mend=mend)
     if meta["choices"] and value not in meta["choices"]:

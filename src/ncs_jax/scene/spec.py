@@ -358,7 +358,9 @@ def load_scene(path: str | Path, preset: str | None = None) -> Scene:
         kind = "a folder" if file.is_dir() else f"a {file.suffix or 'file without suffix'}"
         mend = "of a garment, ncs fit writes one; of a run, ncs view and ncs evaluate read its folder"
         raise InputError("a scene file that ends in .toml expected", file=file, value=kind, mend=mend)
-    tables = read_toml(file)
+    if not (tables := read_toml(file)):
+        mend = 'write [garment] and file = "...", or let ncs fit write it; ncs:tshirt is a packaged one'
+        raise InputError("a scene expected", file=file, value="an empty file", mend=mend)
     if preset is not None and preset not in PRESETS:
         raise InputError(f"one of {', '.join(PRESETS)} expected", field="preset", value=preset)
     for table, values in PRESETS[preset].items() if preset else ():
