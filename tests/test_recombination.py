@@ -17,6 +17,7 @@ from ncs_jax.runs.placed_scene import POOL, PlacedScene
 from ncs_jax.runs.run import assemble, load_run
 from ncs_jax.runs.train import train
 from ncs_jax.scene.spec import load_scene
+from ncs_jax.training.loss import with_bodies
 
 from .scenes import FREE, SCENE, write_scene
 
@@ -97,7 +98,7 @@ def test_a_body_of_one_joint_stands_as_in_a_frame(woman):
 
 
 def test_they_stand_behind_the_motions_and_change_after_a_checkpoint(tmp_path, plain_jax):
-    text = FREE.replace("[training]", "[training]\nrecombined = 0.5")
+    text = SCENE.replace("[training]", "[training]\nrecombined = 0.5")
     a = assemble(load_scene(write_scene(tmp_path, text)))
     placed, frames, batch = PlacedScene(a, 0), len(a.track.start), a.scene.training.batch
     first = placed.features
@@ -111,6 +112,8 @@ def test_they_stand_behind_the_motions_and_change_after_a_checkpoint(tmp_path, p
     assert np.any(placed.features.static[frames:] != first.static[frames:])
     np.testing.assert_array_equal(placed.features.static[:frames], first.static[:frames])
     assert len(a.track.start) == frames
+    anew = with_bodies(a.model, placed.features, batch).bodies
+    np.testing.assert_allclose(placed._everywhere[1].bodies, anew, atol=1e-6)
 
 
 @pytest.mark.parametrize("text", [SCENE, FREE], ids=["pinned", "free"])

@@ -51,25 +51,25 @@ def recombination_of(body: BodyRecord, motions: Sequence[MotionRecord]) -> Recom
     return Recombination(body, poses, limb, pairs, _distances(body, some, pairs).min(axis=0, initial=np.inf))
 
 
-def recombined(limbs: Recombination, count: int, seed: Sequence[int]) -> np.ndarray:
+def recombined(given: Recombination, count: int, seed: Sequence[int]) -> np.ndarray:
     """Return so many poses (count, joints, 3), axis-angle: a pure function of its arguments.
 
     Each limb is as in a frame drawn for it alone, its joints' angles times a factor of `FARTHER`; the root is as in a frame. In
     no pose are two bones nearer to each other than they come in the motions, to `CLOSER`: arms pass through no trunk. Where
     hardly any such pose is found, frames as they are fill the rest.
     """
-    rng, limb = np.random.default_rng(seed), limbs.limb
+    rng, limb = np.random.default_rng(seed), given.limb
     found: list[np.ndarray] = []
     for _ in range(ROUNDS):
         if sum(map(len, found)) >= count:
             break
-        frame = rng.integers(len(limbs.poses), size=(count, limb.max() + 1))
+        frame = rng.integers(len(given.poses), size=(count, limb.max() + 1))
         factor = rng.uniform(*FARTHER, frame.shape)
         factor[:, 0] = 1
-        poses = limbs.poses[frame[:, limb], np.arange(len(limb))] * factor[:, limb, None]
-        poses = poses.astype(limbs.poses.dtype)
-        found.append(poses[np.all(_distances(limbs.body, poses, limbs.pairs) >= CLOSER * limbs.closest, axis=1)])
-    return np.concatenate([*found, limbs.poses[rng.integers(len(limbs.poses), size=count)]])[:count]
+        poses = given.poses[frame[:, limb], np.arange(len(limb))] * factor[:, limb, None]
+        poses = poses.astype(given.poses.dtype)
+        found.append(poses[np.all(_distances(given.body, poses, given.pairs) >= CLOSER * given.closest, axis=1)])
+    return np.concatenate([*found, given.poses[rng.integers(len(given.poses), size=count)]])[:count]
 
 
 def _distances(body: BodyRecord, poses: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -177,6 +177,9 @@ class PlacedScene:
         training, spec, begun = required(self.assembly.training, "training"), self.assembly.scene.training, self._number >= 0
         if number == self._number or (begun and training.shares is None and self._recombination is None):
             return
+        known, same = None, 0
+        if begun and training.shares is None and (bodies := self._everywhere[1].bodies) is not None:
+            known, same = self.local(bodies), len(self._motions.start)
         self._everywhere = None  # before the next one takes as much memory
         self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
         if training.shares is not None:
@@ -189,7 +192,7 @@ class PlacedScene:
             poses = recombined(self._recombination, POOL, [self.seed, 5, number])
             self._bare = _joined(self._motions, _standing(self.assembly.model, poses))
         self.features = self._bare
-        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch)))
+        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch, known, same)))
 
     def _ends(self, first: int, count: int) -> np.ndarray:
         """Return the last frames of the windows of some steps, (count, batch)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 from ncs_jax.energies.elements import energies_and_gradient
 from ncs_jax.energies.terms import StepInputs, Terms
@@ -23,15 +25,22 @@ __all__ = ["gradients", "physics", "with_bodies"]
 BODIES = 3 << 27  # bytes of posed bodies that are kept, at most
 
 
-def with_bodies(model: Model, track: MotionFeatures, batch: int) -> MotionFeatures:
+def with_bodies(model: Model, track: MotionFeatures, batch: int, known: Array | None = None, same: int = 0) -> MotionFeatures:
     """Return the motions with the bodies of all frames posed, `batch` at a time, where collision is by planes.
 
     A motion fixes them; a step looks them up. Where they take more than `BODIES` bytes, each step poses those it sees.
+    `known`: the bodies of an earlier call, which are used up; the first `same` frames are those of then.
     """
     body = model.body
     if body is None or model.terms.collision != "plane" or 2 * len(track.start) * body.nbytes > BODIES:
         return track
-    return replace(track, bodies=jax.jit(posed_bodies, static_argnums=2)(model, track.matrices, batch))
+    bodies = jax.jit(posed_bodies, static_argnums=2)(model, track.matrices[same:], batch)
+    return replace(track, bodies=bodies if known is None else _with_last(known, bodies))
+
+
+@functools.partial(jax.jit, donate_argnums=0)
+def _with_last(frames: Array, last: Array) -> Array:
+    return frames.at[len(frames) - len(last) :].set(last)
 
 
 def physics(model: Model, weights: Blend, offsets, matrices, moving, body=None):
