@@ -19,6 +19,7 @@ from experiments import (
     fast_motion,
     fit_material,
     garments,
+    limits,
     membranes,
     methods,
     seeds,
@@ -29,7 +30,7 @@ from experiments import (
     study,
     unseen,
 )
-from ncs_jax import InputError, assemble, load_scene, scene_from
+from ncs_jax import InputError, assemble, load_scene, scene_from, train
 from ncs_jax.io import read_body, read_motion
 from ncs_jax.io.packaged import packaged
 
@@ -88,7 +89,7 @@ def test_speed_accuracy(tmp_path, capsys):
 @pytest.fixture
 def alone(monkeypatch):
     """Everything in this process: starting others takes longer than what they do here."""
-    for module in (control, garments, methods, unseen):
+    for module in (control, garments, limits, methods, unseen):
         monkeypatch.setattr(module, "apart", lambda job, *arguments: job(*arguments))
     for module in (study, garments, methods, architecture, budget, descriptors):
         monkeypatch.setattr(module, "abreast", lambda jobs: [job(*arguments) for job, *arguments in jobs])
@@ -193,6 +194,24 @@ def test_unseen(alone, tmp_path, monkeypatch, capsys):
     assert float(adapted["minutes"]) == pytest.approx(float(ncs["minutes"]) + 0.05) and adapted["total"] == ncs["total"]
     assert (out / "unseen_sway.png").read_bytes()[:4] == b"\x89PNG" and "| sway | ncs |" in capsys.readouterr().out
     assert unseen.main([str(tmp_path / "nowhere.toml")]) == 2
+
+
+def test_limits(alone, tmp_path, monkeypatch, capsys):
+    """What is trained on is not told; what is turned farther is, and rightly where adapting gains more than a tenth."""
+    run = train(write_scene(tmp_path, FREE), tmp_path / "run", steps=10)
+    np.savez(tmp_path / "far.npz", **swing(size=2.5))
+    gains = iter([1.04, 1.5])
+    found = lambda run, motion, seconds: SimpleNamespace(before={"total": next(gains)}, after={"total": 1.0})  # noqa: E731
+    monkeypatch.setattr(limits, "adapt", found)
+    out = tmp_path / "out"
+    given = [str(tmp_path / "run"), str(tmp_path / "swing.npz"), str(tmp_path / "far.npz"), "--out", str(out)]
+    assert limits.main(given) == 0
+    with (out / "limits.csv").open() as file:
+        known, far = csv.DictReader(file)
+    assert (known["told"], far["told"], known["right"], far["right"]) == ("", "beyond", "yes", "yes")
+    assert float(known["excess"]) == pytest.approx(4) and float(far["expected"]) > 10 > float(known["expected"])
+    assert float(far["outside"]) > 0 and "rightly: 2 of 2" in capsys.readouterr().out and run.steps == 10
+    assert (out / "limits.png").read_bytes()[:4] == b"\x89PNG" and limits.main([str(tmp_path / "nowhere"), "walk"]) == 2
 
 
 def write_sleeve(file, radius=0.085, bottom=0.5, unit=1.0):
