@@ -15,8 +15,10 @@ from ncs_jax.geometry.skinning import Blend
 from ncs_jax.io import read_body
 from ncs_jax.io.packaged import packaged
 from ncs_jax.prepare.posing import joint_transforms
-from ncs_jax.scene.model import body_normals, pose_body, posed_bodies
+from ncs_jax.scene.model import body_normals, pose_body, pose_garment, posed_bodies
 from ncs_jax.scene.step_inputs import step_inputs
+from ncs_jax.simulation.solver.problem import Problem, body_contact
+from ncs_jax.simulation.solver.stiffness import couplings_from
 
 
 def turned(cosines, rotation, shift):
@@ -115,6 +117,23 @@ def test_a_hand_in_a_skirt_pushes_the_skirt_before_it(dress, plain_jax):
         return -np.asarray(jax.grad(energy)(jnp.asarray(x)))[place] @ own[back]
 
     assert pushed(replace(model, beside=None)) > 0 > pushed(model)
+
+
+def test_the_solver_feels_the_same_contact(dress, plain_jax):
+    """With a hand in the skirt: the energy that a step goes down, and its force, are those of the total."""
+    model, matrices = dress.model, reaching(dress, 0.75, np.pi)
+    inputs, terms = step_inputs(model, matrices), replace(model.terms, inertia=False)
+    problem = Problem(model, couplings_from(model.garment.mesh), None, inputs)
+    x = pose_garment(model, jnp.zeros_like(model.garment.mesh.rest), matrices, model.blend)
+
+    def energy(x, step):
+        return energy_terms(x, model.garment, model.material, step, terms, model.surface)["collision"]
+
+    value, slope = jax.value_and_grad(energy)(x, inputs)
+    contact = body_contact(problem, x)
+    np.testing.assert_allclose(contact.energy, value, rtol=1e-5)
+    np.testing.assert_allclose(contact.gradient, slope, atol=1e-5 * float(jnp.abs(slope).max()))
+    assert float(energy(x, replace(inputs, normals=None))) != pytest.approx(float(value), rel=0.01)
 
 
 def test_many_frames_are_as_each_by_itself(dress, plain_jax):

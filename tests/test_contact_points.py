@@ -129,7 +129,7 @@ def test_the_gradient_is_that_of_differences_and_the_solver_has_both(kind, rng):
     terms, numbers = replace(NOTHING, collision=kind), material()
     energy = jax.jit(lambda x: body_collision(x, body, surface, terms, numbers))
     value, slope = jax.value_and_grad(energy)(x)
-    contact = jax.jit(lambda x: evaluate_contact(x, body, surface, numbers, terms))(x)
+    contact = jax.jit(lambda x: evaluate_contact(x, StepInputs(body=body), surface, numbers, terms))(x)
     np.testing.assert_allclose(contact.energy, value, rtol=1e-12)
     np.testing.assert_allclose(contact.gradient, slope, rtol=0, atol=1e-12 * float(jnp.abs(slope).max()))
     way = jnp.asarray(rng.normal(size=x.shape))
@@ -197,7 +197,7 @@ def test_the_blocks_are_the_hessian_on_planes():
     x, garment, body, surface = on_a_ball("plane")
     terms, numbers = replace(NOTHING, collision="plane"), material()
     couplings = couplings_from(garment.mesh, surface.points)
-    blocks = evaluate_contact(x, body, surface, numbers, terms).blocks
+    blocks = evaluate_contact(x, StepInputs(body=body), surface, numbers, terms).blocks
     found = dense(couplings, *stiffness(x, couplings, garment, numbers, StepInputs(body=body), terms, blocks))
     slope = jax.jit(jax.grad(lambda x: body_collision(x, body, surface, terms, numbers)))
     column = jax.jit(lambda v: jax.jvp(slope, (x,), (v.reshape(x.shape),))[1].reshape(-1))
@@ -216,7 +216,9 @@ def test_some_of_smooth_contact_is_part_of_all():
     carried = np.flatnonzero((np.isin(points.corners, own) & (np.asarray(points.weights) > 0)).any(axis=1))
     every = len(x) + len(points.corners)
     only = jnp.asarray(np.concatenate([own, len(x) + carried, [every, every]]), jnp.int32)
-    whole, some = (evaluate_contact(x, body, surface, numbers, terms, only=rows) for rows in (None, only))
+    whole, some = (
+        evaluate_contact(x, StepInputs(body=body), surface, numbers, terms, only=rows) for rows in (None, only)
+    )
     np.testing.assert_allclose(some.gradient[own], whole.gradient[own], rtol=0, atol=1e-9)
     np.testing.assert_allclose(some.blocks[only[:-2]], whole.blocks[only[:-2]], rtol=0, atol=1e-6)
     others = np.setdiff1d(np.arange(every), np.asarray(only))

@@ -47,7 +47,7 @@ def garment(shape, dtype=jnp.float64, seed=None):
 
 @partial(jax.jit, static_argnames="terms", compiler_options=QUICK)
 def blocks(x, couplings, cloth, numbers, frame, terms, surface=None):
-    contact = None if terms.collision is None else evaluate_contact(x, frame.body, surface, numbers, terms).blocks
+    contact = None if terms.collision is None else evaluate_contact(x, frame, surface, numbers, terms).blocks
     return stiffness(x, couplings, cloth, numbers, frame, terms, contact)
 
 
@@ -280,7 +280,7 @@ def read(terms):
     names = [f.name for f in dataclasses.fields(numbers) for _ in jax.tree.leaves(getattr(numbers, f.name))]
 
     def made(n):
-        contact = None if terms.collision is None else evaluate_contact(x, frame.body, surface, n, terms).blocks
+        contact = None if terms.collision is None else evaluate_contact(x, frame, surface, n, terms).blocks
         return stiffness(x, couplings, cloth, n, frame, terms, contact)
 
     traced = jax.make_jaxpr(made)(numbers).jaxpr

@@ -12,8 +12,9 @@ from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.points import on_vertices, with_points
 from ncs_jax.energies.contact.smooth import Quadrics, blended_contact, nearby_quadrics
 from ncs_jax.energies.contact.surface import Surface
-from ncs_jax.energies.terms import Material, Terms
+from ncs_jax.energies.terms import Material, StepInputs, Terms
 from ncs_jax.energies.total import distances
+from ncs_jax.errors import required
 
 __all__ = ["Contact", "evaluate_contact"]
 
@@ -29,7 +30,7 @@ class Contact(NamedTuple):
 
 def evaluate_contact(
     x: Float[Array, "verts 3"],
-    body: Float[Array, "body 3"],
+    step: StepInputs,
     surface: Surface,
     material: Material,
     terms: Terms,
@@ -39,14 +40,14 @@ def evaluate_contact(
     """Return the contact of all vertices and of the points between them, each of which touches the body by itself.
 
     Args:
-        x, body: positions in m. near: the body near the garment, where contact is smooth and it is known already.
+        x: positions in m. step: where the body is. near: the body near the garment, where contact is smooth and that is known.
         only: of smooth contact, the vertices and points that count, padded with how many there are; the others are taken as far
             away.
     """
-    stiffness, points = material.collision, surface.points
+    stiffness, points, body = material.collision, surface.points, required(step.body, "step.body")
     x = with_points(x, points)
     if terms.collision != "smooth":
-        distance, back = jax.vjp(lambda x: distances(x, body, surface, terms), x)
+        distance, back = jax.vjp(lambda x: distances(x, body, surface, terms, step.normals), x)
         (normal,) = back(jnp.ones_like(distance))
         energy, slope = jax.value_and_grad(collision)(distance, material.thickness, stiffness)
         pushing = jnp.where(distance < material.thickness, 2 * stiffness, 0)

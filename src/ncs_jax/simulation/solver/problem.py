@@ -197,8 +197,7 @@ def body_contact(problem: Problem, x: Float[Array, "verts 3"]) -> Contact | None
     if model.terms.collision is None:
         return None
     quadrics = None if problem.neighbours is None else problem.neighbours.quadrics
-    body = required(problem.step.body, "step.body")
-    return evaluate_contact(x, body, problem.surface, model.material, model.terms, quadrics, problem.only)
+    return evaluate_contact(x, problem.step, problem.surface, model.material, model.terms, quadrics, problem.only)
 
 
 def evaluate(problem: Problem, x: Float[Array, "verts 3"]) -> Point:
