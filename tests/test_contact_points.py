@@ -216,9 +216,7 @@ def test_some_of_smooth_contact_is_part_of_all():
     carried = np.flatnonzero((np.isin(points.corners, own) & (np.asarray(points.weights) > 0)).any(axis=1))
     every = len(x) + len(points.corners)
     only = jnp.asarray(np.concatenate([own, len(x) + carried, [every, every]]), jnp.int32)
-    whole, some = (
-        evaluate_contact(x, StepInputs(body=body), surface, numbers, terms, only=rows) for rows in (None, only)
-    )
+    whole, some = (evaluate_contact(x, StepInputs(body=body), surface, numbers, terms, only=rows) for rows in (None, only))
     np.testing.assert_allclose(some.gradient[own], whole.gradient[own], rtol=0, atol=1e-9)
     np.testing.assert_allclose(some.blocks[only[:-2]], whole.blocks[only[:-2]], rtol=0, atol=1e-6)
     others = np.setdiff1d(np.arange(every), np.asarray(only))

@@ -46,6 +46,7 @@ NAMES = (
     "inertia",
     "self_contact",
     "hold",
+    "untangling",
     "total",
 )
 # What a log and an evaluation write beside the energies: a term of this name would be lost among them.

@@ -37,8 +37,8 @@ def model_from(files: SceneFiles, prepared: Prepared, dtype) -> Model:
     if collides and body is not None:
         body_points = jax.device_put(np.asarray(body.vertices[prepared.part], dtype))
         body_blend = blend_from(body_weights[:, kept], dtype=dtype) if body.frames is None else None
-    keeps_apart = physics.self_contact.stiffness > 0
-    pins, groups = jax.device_put(files.pins), groups_from(files.mesh) if keeps_apart else None
+    looks = physics.self_contact.stiffness > 0 or scene.training.untangling > 0  # at where the garment meets itself
+    pins, groups = jax.device_put(files.pins), groups_from(files.mesh) if looks else None
     return Model(
         skeleton=Skeleton(jax.device_put(np.asarray(joints[kept], dtype)), kept_parents),
         rest_rotations=None if rest_rotations is None else jax.device_put(np.asarray(rest_rotations[kept], dtype)),

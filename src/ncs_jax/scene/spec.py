@@ -214,6 +214,7 @@ class TrainingSpec:
     motion_augmentation: float = _f(0.0, "share of a batch that gets another window's motion", low=0, high=1)
     recombined: float = _f(0.0, "share of a batch in poses put together of the motions' limbs", low=0, high=0.9)
     focus: float = _f(0.0, "share of a batch from the frames in which contact costs most", low=0, high=0.9)
+    untangling: float = _f(0.0, "J/m of the curves along which the garment passes through itself", low=0, high=1e6)
     validate_every: int = _f(200, "steps between validations", low=1, high=10_000_000)
     checkpoint_every: int = _f(200, "steps between checkpoints", low=1, high=10_000_000)
     seed: int = _f(0, "seed of all random numbers", low=0, high=2**31 - 1)

@@ -109,7 +109,8 @@ def step(task: Task, steps, state: TrainState, track: MotionFeatures, indices) -
     Within a `shard_map` they are this device's share of the batch and the rest is every device's.
     """
     (ends, _), axis = indices, task.axis
-    grads, parts, (g, offsets) = gradients(task.model, task.network, state.params, track, windows_of(task, *indices))
+    windows, untangling = windows_of(task, *indices), task.spec.untangling
+    grads, parts, (g, offsets) = gradients(task.model, task.network, state.params, track, windows, untangling)
     sample_good = jnp.all(jnp.isfinite(g), axis=(0, 1)) & jnp.isfinite(sum(parts.values()))
     if axis is not None:
         sample_good = lax.all_gather(sample_good, axis, tiled=True)
