@@ -321,5 +321,5 @@ def _scene(options, out: Path, found, body) -> str:
         lines += ["", "[physics.bending]", f"stiffness = {fine.stiffness:g}  {why}"]
     lines += ["", "[physics.collision]", *told, 'points = "auto"'] if told else []
     if body.frames is None:
-        lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5", "recombined = 0.3"]
+        lines += ["", "[training]", "window = 15", "motion_augmentation = 0.5", "recombined = 0.3", "untangling = 0.3"]
     return "\n".join(lines) + "\n"
