@@ -87,6 +87,7 @@ def tangle(model: Model, untangling: float, turn, x) -> tuple[dict[str, Array], 
         E = k_u L,   L of `intersections.contour_length`
 
     It is looked at in one pose in `UNTANGLED`, others from step to step, which count for all: the mean is that of all poses.
+    Of cloth so crumpled that the search runs out of room, the curves that it found count.
 
     Args:
         untangling: k_u, J/m. turn: any whole number; it chooses the poses. x: (verts, 3, poses), m.

@@ -20,7 +20,7 @@ STEEP = 5.0  # times its own length that an end of a curve moves, at most, where
 
 
 class Crossings(NamedTuple):
-    """Edges that go through triangles, where the list is not full the last one repeated; and which faces beside them do.
+    """Edges that go through triangles, and which faces beside them do: none where the list is not full.
 
     `overflow`: there are more than the search has room for.
     """
