@@ -62,10 +62,15 @@ def body_collision(x, body, surface: Surface, terms: Terms, material: Material, 
 
 
 def contact_force(
-    x: Float[Array, "verts 3"], body: Float[Array, "body 3"], surface: Surface, terms: Terms, material: Material
+    x: Float[Array, "verts 3"],
+    body: Float[Array, "body 3"],
+    surface: Surface,
+    terms: Terms,
+    material: Material,
+    normals: Float[Array, "body 3"] | None = None,
 ) -> Float[Array, "verts 3"]:
     """Return how the body's contact resists: the derivative of `body_collision` in N, towards the body."""
-    return jax.grad(body_collision)(x, body, surface, terms, material)
+    return jax.grad(body_collision)(x, body, surface, terms, material, normals)
 
 
 def _self_contact(x, garment: Garment, material: Material):

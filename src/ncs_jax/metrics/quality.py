@@ -32,7 +32,7 @@ from ncs_jax.geometry.numerics import angle_between
 from ncs_jax.geometry.skinning import blend, unpose
 from ncs_jax.metrics.penetration import depths_in, depths_on_host
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body, resting_body
+from ncs_jax.scene.model import Model, resting_body, touched_body
 from ncs_jax.scene.step_inputs import Past, step_inputs
 
 __all__ = ["PARTS", "QUANTITIES", "measure", "measure_on_host", "summarise"]
@@ -126,10 +126,10 @@ def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict
     verts, sides = len(mesh.rest), len(mesh.edges)
 
     def one(frame):
-        x, body = frame.x, pose_body(model, frame.matrices)
+        x, (body, normals) = frame.x, touched_body(model, frame.matrices)
         if surface is None:
             own = required(model.surface, "model.surface")
-            depth = -distances(with_points(x, own.points), body, own, model.terms)[:verts]
+            depth = -distances(with_points(x, own.points), body, own, model.terms, normals)[:verts]
         else:
             depth = depths_in(with_middles(x, mesh.edges, mesh.faces), body, surface, bool(model.under))
         found = {name: 100 * jnp.mean(depth[:verts] > least) for name, least in INSIDE.items()}

@@ -31,6 +31,7 @@ __all__ = [
     "pose_rest",
     "posed_bodies",
     "resting_body",
+    "touched_body",
 ]
 
 
@@ -172,6 +173,15 @@ def body_normals(
     surface = required(model.surface, "model.surface")
     normals = vertex_normals(body, surface)
     return normals if model.beside is None else turned_inwards(normals, body, matrices, model.beside)
+
+
+def touched_body(
+    model: Model, matrices: Float[Array, "joints 3 4 *poses"]
+) -> tuple[Float[Array, "body 3 *poses"], Float[Array, "body 3 *poses"] | None]:
+    """Return the posed touchable body, m, and `body_normals` where contact reads them and they are not the body's own."""
+    body = pose_body(model, matrices)
+    turned = model.terms.collision == "plane" and model.beside is not None
+    return body, body_normals(model, body, matrices) if turned else None
 
 
 def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:

@@ -14,7 +14,7 @@ from ncs_jax.energies.total import contact_force
 from ncs_jax.errors import InputError, required
 from ncs_jax.geometry.skinning import blend, skin, unpose
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, body_normals, pose_body
+from ncs_jax.scene.model import Model, touched_body
 
 __all__ = ["Past", "frame_inputs", "step_inputs"]
 
@@ -56,9 +56,7 @@ def step_inputs(
     terms, past = model.terms, past or Past()
     posed = normals = None
     if model.surface is not None and (terms.collision is not None or terms.own):
-        posed, normals = (pose_body(model, matrices), None) if body is None else (body[:, :3], body[:, 3:])
-        if normals is None and terms.collision == "plane" and model.beside is not None:
-            normals = body_normals(model, posed, matrices)
+        posed, normals = touched_body(model, matrices) if body is None else (body[:, :3], body[:, 3:])
     if not (terms.pinning or terms.friction or terms.own):
         transforms = None
     elif transforms is None:
@@ -66,7 +64,7 @@ def step_inputs(
     advected = lagged = None
     if terms.friction:
         advected = skin(required(transforms, "transforms"), required(past.unposed, "past.unposed"))
-        lagged = _lagged_normal_force(model, advected, posed)
+        lagged = _lagged_normal_force(model, advected, posed, normals)
     inertia = terms.inertia or bool(terms.own)
     return StepInputs(
         1 / model.fps,
@@ -118,10 +116,12 @@ def frame_inputs(
     return step_inputs(model, track.matrices[frame], Past(previous, before, unposed))
 
 
-def _lagged_normal_force(model: Model, advected, body) -> Float[Array, "verts 3 *poses"]:
+def _lagged_normal_force(model: Model, advected, body, normals) -> Float[Array, "verts 3 *poses"]:
     def one(pose):
-        return contact_force(*pose, model.surface, model.terms, model.material)
+        x, body, normals = pose
+        return contact_force(x, body, model.surface, model.terms, model.material, normals)
 
+    given = advected, body, normals
     if advected.ndim == 2:
-        return one((advected, body))
-    return jnp.moveaxis(lax.map(one, (jnp.moveaxis(advected, -1, 0), jnp.moveaxis(body, -1, 0))), 0, -1)
+        return one(given)
+    return jnp.moveaxis(lax.map(one, jax.tree.map(lambda each: jnp.moveaxis(each, -1, 0), given)), 0, -1)

@@ -17,7 +17,7 @@ from ncs_jax.geometry.mesh import edge_strain
 from ncs_jax.geometry.numerics import norm
 from ncs_jax.network.methods.method import Method, decode, garment_blend
 from ncs_jax.scene.features import MotionFeatures
-from ncs_jax.scene.model import Model, pose_body, pose_garment
+from ncs_jax.scene.model import Model, pose_garment, touched_body
 from ncs_jax.training.loss import physics
 from ncs_jax.training.step import Fault
 
@@ -44,7 +44,8 @@ def training_metrics(
         result = {"strain": 100 * jnp.mean(edge_strain(x, mesh))}
         if model.terms.collision is not None:
             surface = required(model.surface, "model.surface")
-            d = distances(with_points(x, surface.points), pose_body(model, matrices), surface, model.terms)
+            body, normals = touched_body(model, matrices)
+            d = distances(with_points(x, surface.points), body, surface, model.terms, normals)
             result["penetrating"] = 100 * jnp.mean(d[: len(x)] < 0)
         return result
 
@@ -70,7 +71,8 @@ def contact_energies(model: Model, network: Method, window: int, params, track: 
     def one(args):
         offset, matrices = args
         x = pose_garment(model, offset, matrices, weights)
-        return body_collision(x, pose_body(model, matrices), surface, model.terms, model.material)
+        body, normals = touched_body(model, matrices)
+        return body_collision(x, body, surface, model.terms, model.material, normals)
 
     return lax.map(one, (jnp.moveaxis(offsets, -1, 0), track.matrices[ends]))
 
