@@ -106,11 +106,11 @@ def test_the_page_plays_scrubs_and_colours(carried):
         window.wait(0.2)
         assert window.frame == 7 and window.other.visible
         middle = there[7].mean(axis=0) * [1, 0, 1]
-        np.testing.assert_allclose(window.cloth.vertices, there[7] - middle, atol=1e-5)
+        np.testing.assert_allclose(window.cloths[0][1].vertices, there[7] - middle, atol=1e-5)
         for name in COLOURS:
             window.colour.value = name
             window.wait(0.1)
-            assert name in window.caption.content and not window.cloth.visible
+            assert name in window.caption.content and not window.cloths[0][1].visible
             assert sum(len(part.faces) for part in window.bins if part.visible) == len(window.faces)
         assert "mean 34.6" in window.caption.content  # mm: 20 along each axis
     finally:

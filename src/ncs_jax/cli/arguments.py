@@ -149,7 +149,7 @@ def check_not_read(out: str, *read: str | Path) -> None:
 
 def check_scene_kept(out: str, scene, *motions: str) -> None:
     """Raise an InputError where a file that is to be written is one that a scene, or a motion beside it, is read from."""
-    given = scene.body.file, scene.body.mesh, scene.garment.file, *scene.garment.over, *scene.motions
+    given = scene.body.file, scene.body.mesh, scene.garment.file, *scene.garment.over, *scene.garment.layers, *scene.motions
     own = [scene.path(name) for name in given if name not in ("", "none") and not name.startswith("ncs:")]
     check_not_read(out, *filter(None, [scene.source]), *own, *motions)
 

@@ -152,6 +152,10 @@ def _tell_scene(setting: Setting, *, automatic: bool) -> None:
         tell("shape", f"betas {', '.join(f'{b:.3g}' for b in setting.prepared.betas)}")
     for note in (*(() if setting.body is None else setting.body.notes), *record.notes):
         tell("note", note)
+    for name, first, stop in zip(
+        setting.scene.garment.layers, record.layers, (*record.layers[1:], len(record.vertices)), strict=False
+    ):
+        tell("layer", f"{name}: {stop - first} vertices, from {first} on")
     for name, layer in zip(setting.scene.garment.over, model.under, strict=False):
         tell("over", f"{name}: {len(layer.rest)} vertices")
     moving = setting.body is not None and setting.body.frames is not None  # of which no network reads joints

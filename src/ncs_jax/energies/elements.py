@@ -45,10 +45,7 @@ def energies_and_gradient(
     if x.ndim == 2:
         return _one_pose(x, garment, material, step, terms, surface)
     parts, gradient = elastic(x, garment, material, terms)
-    plane = "plane" if terms.collision == "plane" else None
-    lanes = replace(
-        terms, membrane=None, bending=False, collision=plane, friction=False, pinning=False, self_contact=False, own=()
-    )
+    lanes, alone = _beside_and_alone(terms)
 
     def value(x):
         some = energy_terms(x, garment, material, step, lanes, surface)
@@ -56,10 +53,7 @@ def energies_and_gradient(
 
     slope, some = jax.grad(value, has_aux=True)(x)
     parts, gradient = parts | some, gradient + slope
-    alone = replace(
-        terms, membrane=None, bending=False, collision=None if plane else terms.collision, gravity=False, inertia=False
-    )
-    if alone.collision is None and not (alone.friction or alone.pinning or alone.self_contact or alone.own):
+    if alone.collision is None and not (alone.friction or alone.pinning or alone.self_contact or alone.own or alone.layers):
         return parts, gradient, None
 
     step = replace(step, force=None)
@@ -74,6 +68,23 @@ def energies_and_gradient(
     some, slope, to_transforms = lax.map(each, jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), (x, given)))
     to_transforms = None if to_transforms is None else jnp.moveaxis(to_transforms, 0, -1)
     return parts | some, gradient + jnp.moveaxis(slope, 0, -1), to_transforms
+
+
+def _beside_and_alone(terms: Terms) -> tuple[Terms, Terms]:
+    """Return the terms but membrane and bending: those of poses beside each other, and those of a pose at a time."""
+    rest = replace(terms, membrane=None, bending=False)
+    plane, planes = (how == "plane" for how in (terms.collision, terms.layers))
+    lanes = replace(
+        rest,
+        collision=terms.collision if plane else None,
+        layers=terms.layers if planes else None,
+        friction=False,
+        pinning=False,
+        self_contact=False,
+        own=(),
+    )
+    contact = None if plane else terms.collision
+    return lanes, replace(rest, collision=contact, layers=None if planes else terms.layers, gravity=False, inertia=False)
 
 
 def _needed(step: StepInputs, terms: Terms) -> StepInputs:

@@ -13,6 +13,7 @@ from ncs_jax.energies import baraff_witkin as _baraff_witkin
 from ncs_jax.energies import neo_hookean as _neo_hookean
 from ncs_jax.energies import stvk as _stvk
 from ncs_jax.energies.baraff_witkin import baraff_witkin
+from ncs_jax.energies.contact.layers import Upper
 from ncs_jax.energies.contact.pairs import Groups
 from ncs_jax.energies.mass_spring import mass_spring
 from ncs_jax.energies.neo_hookean import neo_hookean
@@ -45,6 +46,7 @@ NAMES = (
     "external",
     "inertia",
     "self_contact",
+    "layers",
     "hold",
     "untangling",
     "total",
@@ -54,6 +56,7 @@ MEASURED = (
     *("step", "strain", "moved", "dropped", "seconds"),
     *("strain_mean", "strain_p99", "shear_mean", "hinge_mean", "penetrating", "depth_max"),
     *("middle_penetrating", "middle_depth_max", "centre_penetrating", "centre_depth_max"),
+    *("layer_penetrating", "layer_depth_max"),
     *("within_1mm", "self_intersecting", "body_intersecting", "skin_pixels", "skin_share"),
     *("out_of_balance", "gradient_norm", "outside", "speed", "lag", "settling", "overshoot"),
     *("gain", "dynamic_share", "stopped_share", "hem_correlation", "distance"),
@@ -90,6 +93,7 @@ class Terms:
     through_time: bool = False  # inertia's target carries a gradient
     pinning: bool = False
     self_contact: bool = False
+    layers: str | None = None  # contact between garments worn together: "plane", "triangle" or None
     own: tuple[OwnTerm, ...] = ()  # terms of one's own, each a pure function of positions and step inputs
 
     def __post_init__(self):
@@ -132,11 +136,15 @@ class Material:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Garment:
-    """What a garment is to the energies: its mesh, which vertices are pinned, and its groups where there is self-contact."""
+    """What a garment is to the energies: its mesh, which vertices are pinned, its groups where it looks for itself.
+
+    uppers: the garments of the mesh that are worn over others of it, where these touch as layers.
+    """
 
     mesh: Mesh
     pins: Int[Array, "pins"]
     groups: Groups | None = None
+    uppers: tuple[Upper, ...] = ()
 
 
 @jax.tree_util.register_dataclass

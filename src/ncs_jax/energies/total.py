@@ -13,6 +13,7 @@ from ncs_jax.energies.contact.between import with_between
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import nearest_distance, plane_distance
 from ncs_jax.energies.contact.friction import friction
+from ncs_jax.energies.contact.layers import layers
 from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.pairs import nearby_pairs
 from ncs_jax.energies.contact.points import with_points
@@ -91,6 +92,18 @@ def _friction(x, step: StepInputs, material: Material):
     return _counted(friction(x, advected, pressed, material.friction, step.dt), step.moving)
 
 
+def _pinning(x, garment: Garment, step: StepInputs, material: Material):
+    pins = garment.pins
+    unposed = unpose(required(step.vertex_transforms, "step.vertex_transforms")[pins], x[pins])
+    return pinning(unposed, garment.mesh.rest[pins], material.pinning)
+
+
+def _inertia(x, step: StepInputs, mass, *, through_time: bool):
+    target = project(required(step.previous, "step.previous"), required(step.before, "step.before"))
+    target = target if through_time else lax.stop_gradient(target)
+    return _counted(inertia(x, target, mass, step.dt), step.moving)
+
+
 def _mesh_of(x, mesh: Mesh) -> Mesh:
     """Return the mesh of positions, after a check that they are of it."""
     if x.shape[:2] != mesh.rest.shape:
@@ -109,10 +122,10 @@ def energy_terms(
 ) -> dict[str, Float[Array, "*poses"]]:
     """Return every term of the total energy (10) by name, in J.
 
-        L = membrane + bending + collision + friction + gravity + pinning + own terms - f . x + inertia + self-contact
+        L = membrane + bending + collision + friction + gravity + pinning + own terms - f . x + inertia + self-contact + layers
 
     Args:
-        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity, inertia and the "plane" collision.
+        x: (verts, 3) positions in m; (verts, 3, *poses) for membrane, bending, gravity, inertia and contact by "plane".
         garment, material: what is constant. step: what this step brings, from `scene.step_inputs`.
         terms: which terms exist. surface: the touchable body, where there is collision.
 
@@ -141,9 +154,7 @@ def energy_terms(
             parts["gravity"] = gravity(x, mass, material.gravity)
     if terms.pinning:
         with jax.named_scope("pinning"):
-            pins = garment.pins
-            unposed = unpose(required(step.vertex_transforms, "step.vertex_transforms")[pins], x[pins])
-            parts["pinning"] = pinning(unposed, mesh.rest[pins], material.pinning)
+            parts["pinning"] = _pinning(x, garment, step, material)
     for term in terms.own:
         with jax.named_scope(term.__name__):
             parts[term.__name__] = _own_energy(term, x, step)
@@ -152,12 +163,13 @@ def energy_terms(
             parts["external"] = -jnp.sum(step.force * x, axis=(0, 1))
     if terms.inertia:
         with jax.named_scope("inertia"):
-            target = project(required(step.previous, "step.previous"), required(step.before, "step.before"))
-            target = target if terms.through_time else lax.stop_gradient(target)
-            parts["inertia"] = _counted(inertia(x, target, mass, step.dt), step.moving)
+            parts["inertia"] = _inertia(x, step, mass, through_time=terms.through_time)
     if terms.self_contact:
         with jax.named_scope("self_contact"):
             parts["self_contact"] = _self_contact(x, garment, material)
+    if terms.layers is not None:
+        with jax.named_scope("layers"):
+            parts["layers"] = layers(x, garment.uppers, material.thickness, material.collision, planes=terms.layers == "plane")
     return parts
 
 

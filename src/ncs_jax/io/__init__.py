@@ -7,6 +7,7 @@ from ncs_jax.io.character.moving_body import is_moving_body, read_moving_body
 from ncs_jax.io.character.smpl_model import read_betas
 from ncs_jax.io.character.write_body import write_body
 from ncs_jax.io.mesh.garment import read_garment, write_garment
+from ncs_jax.io.mesh.joined import worn_together
 from ncs_jax.io.records import AnimationRecord, BodyRecord, GarmentRecord, MotionRecord
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "read_garment",
     "read_motion",
     "read_moving_body",
+    "worn_together",
     "write_animation",
     "write_body",
     "write_garment",

@@ -58,6 +58,7 @@ class GarmentRecord:
             file's vertices were merged into another. weights: (V, J) skinning weights, not negative, every row sums to 1; None:
             the body's. joint_names: the J joints of the weights, none where they are the body's, in its order. notes: what was
             mended in the file.
+        layers: the first vertex of each garment but the innermost, of several that are worn together; see `worn_together`.
     """
 
     vertices: np.ndarray
@@ -70,6 +71,7 @@ class GarmentRecord:
     weights: np.ndarray | None = None
     joint_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    layers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import angles
+from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.intersections import intersecting
+from ncs_jax.energies.contact.layers import Upper
 from ncs_jax.energies.contact.pairs import Groups, groups_from
 from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
@@ -51,6 +53,8 @@ QUANTITIES = {
     "centre_penetrating": ("%", "triangles whose centre is inside the body"),
     "centre_depth_max": ("mm", "deepest penetration of a triangle's centre"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment"),
+    "layer_penetrating": ("%", "vertices of garments worn over others that are inside one of these"),
+    "layer_depth_max": ("mm", "deepest penetration of a garment into one that is worn below it"),
     "body_intersecting": ("%", "triangles of the garment that one of the body passes through"),
     "skin_pixels": ("px", "pixels of six views in which skin shows through the garment that covers it at rest"),
     "skin_share": ("%", "the same as a share of the pixels that show the garment, or skin through it"),
@@ -143,6 +147,18 @@ def _penetration(model: Model, surface: Surface | None, frames: _Frames) -> dict
 
 
 @jax.jit
+def _layer_depths(uppers: tuple[Upper, ...], frames: _Frames) -> dict[str, Float[Array, "frames"]]:
+    """Measure how much of garments is inside others of the same mesh that are worn below them, by exact distance."""
+
+    def one(x):
+        own = [nearest_distance(x[upper.first : upper.stop], x[: upper.first], upper.below) for upper in uppers]
+        depth = -jnp.concatenate(own)
+        return {"layer_penetrating": 100 * jnp.mean(depth > 0), "layer_depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
+
+    return lax.map(one, frames.seen_from_root()[0].x)
+
+
+@jax.jit
 def _intersections(mesh: Mesh, groups: Groups, frames: _Frames) -> dict[str, Float[Array, "frames"]]:
     """Measure how much of a garment passes through itself; NaN where the search ran out of room."""
 
@@ -161,7 +177,7 @@ def _surface_of_all(model: Model) -> Surface:
 
 
 _SUMMARY: dict[str, Callable[..., np.floating]] = {
-    **{f"{name}depth_max": np.max for name in PARTS}, "out_of_balance": np.median,
+    **{f"{name}depth_max": np.max for name in (*PARTS, "layer_")}, "out_of_balance": np.median,
 }  # fmt: skip
 
 BLOCK = 64  # frames measured at once, so that motions of every length share one compilation
@@ -201,6 +217,8 @@ def measure(
         # By exact distance it is the same program whatever the terms: compiled once for all scenes of these meshes.
         bare = replace(model, terms=Terms(), vibrations=None) if exact else model
         programs.append(functools.partial(_penetration, bare, _surface_of_all(model) if exact else None))
+    if model.garment.uppers:
+        programs.append(functools.partial(_layer_depths, model.garment.uppers))
     if model.terms.self_contact if self_contact is None else self_contact:
         mesh = model.garment.mesh
         programs.append(functools.partial(_intersections, mesh, model.garment.groups or groups_from(mesh)))

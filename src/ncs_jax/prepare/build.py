@@ -26,7 +26,7 @@ from ncs_jax.prepare.moving_body import frame_features
 from ncs_jax.prepare.prepared import Prepared
 from ncs_jax.prepare.retarget import body_names
 from ncs_jax.prepare.setting import Below, Setting, cell_of, set_up
-from ncs_jax.prepare.touchable import beside_of, surface_of, touchable_faces
+from ncs_jax.prepare.touchable import beside_of, surface_of, touchable_faces, uppers_of
 from ncs_jax.scene.features import MotionFeatures, mirror, motion_features
 from ncs_jax.scene.model import Layer, Model, RitzModes, local_rotations
 from ncs_jax.scene.spec import Scene
@@ -146,6 +146,8 @@ def build(
         model = replace(model, surface=surface_of(model, faces, track, smooth=smooth, pieces=prepared.pieces))
         if scene.physics.collision.distance == "plane":
             model = replace(model, beside=beside_of(model))
+    if model.terms.layers:
+        model = replace(model, garment=replace(model.garment, uppers=uppers_of(model, setting.garment.layers, track)))
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")

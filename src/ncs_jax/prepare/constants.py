@@ -97,6 +97,7 @@ def _terms(files: SceneFiles, *, collides: bool, moves: bool) -> Terms:
     """Return which terms of the energy the scene has; the others are not traced."""
     physics = files.scene.physics
     membrane, stiffnesses = _membrane(physics)
+    touching = collides and files.garment.layers and not physics.self_contact.stiffness  # which sees all cloth
     return Terms(
         membrane=membrane if any(stiffnesses) else None,
         bending=physics.bending.stiffness > 0 and len(files.mesh.hinges) > 0,
@@ -107,4 +108,5 @@ def _terms(files: SceneFiles, *, collides: bool, moves: bool) -> Terms:
         inertia=physics.inertia and moves,
         pinning=len(files.pins) > 0 and physics.pinning.stiffness > 0,
         self_contact=physics.self_contact.stiffness > 0,
+        layers=None if not touching else "plane" if physics.collision.distance == "plane" else "triangle",
     )

@@ -118,7 +118,8 @@ def _mesh(a: Setting) -> Iterator[Risk]:
     yield from _outside("height of a triangle", worst, shown, "its strain is lost in rounding", clean)
     if len(through := crossing_pairs(x, faces)):
         value = f"{len(through)} pairs of triangles, first {through[0, 0]} and {through[0, 1]}"
-        yield Risk("garment through itself at rest", value, "it stays so", "ncs fit smooths small folds, else bring it apart")
+        kept = "a simulation keeps it so" if a.scene.training.untangling or a.model.terms.layers else "it stays so"
+        yield Risk("garment through itself at rest", value, kept, "ncs fit smooths small folds, else bring it apart")
     if twice := doubled(x, faces):
         mend = f"garment.weld = {TOGETHER:g}"
         yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", mend)

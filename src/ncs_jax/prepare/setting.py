@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +75,11 @@ def set_up(
         prepared = _prepared(files, [motions[name] for name in scene.motion.files])
         prepared = replace(prepared, betas=betas, **made_from(files))
     model = model_from(files, prepared, dtype)
+    if scene.garment.layers and not (model.terms.layers or model.terms.self_contact):
+        raise InputError(
+            "contact expected, by which garments worn together feel each other", file=scene.source, field="garment.layers",
+            value=scene.garment.layers, mend="put them on a body, with physics.collision.stiffness above 0",
+        )  # fmt: skip
     automatic = scene.network.cell == "auto"
     scene = cell_of(with_cell(scene), not model.moves or model.terms.pinning or model.body is not None, automatic)
     return Setting(scene, prepared, model, files.body, files.garment, motions)
@@ -151,6 +157,8 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
     if person.file not in ("", "none"):
         scene.there(person.file, "body.file")
     scene.there(spec.file, "garment.file")
+    for i, name in enumerate(spec.layers):
+        scene.there(name, f"garment.layers[{i}]")
     if scene.moves_by_itself:
         body = moving_body(scene)
     elif person.file not in ("", "none"):
@@ -162,20 +170,28 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
             part=person.meshes,
             correctives=person.correctives,
         )
-    garment = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
-    if body is not None:
-        garment = with_body_weights(garment, body)
     if body is not None:
         check_body_size(scene.path(scene.body.file), body)
-        _check_garment(scene, garment, body)
+    worn = [_read_garment(scene, name, body) for name in (spec.file, *spec.layers)]
+    garment = io.worn_together((spec.file, *spec.layers), worn) if spec.layers else worn[0]
     pins, layers = _pins(scene, garment), _layers(scene, body, below, dtype)
     mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
     return SceneFiles(scene, body, garment, mesh, pins, layers)
 
 
-def _check_garment(scene: Scene, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
+def _read_garment(scene: Scene, name: str, body: io.BodyRecord | None) -> io.GarmentRecord:
+    """Return the garment of a file, on the body and with the weights of its joints, if it has any."""
+    spec = scene.garment
+    garment = io.read_garment(scene.path(name), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    if body is None:
+        return garment
+    garment = with_body_weights(garment, body)
+    _check_garment(scene, scene.path(name), garment, body)
+    return garment
+
+
+def _check_garment(scene: Scene, file: Path, garment: io.GarmentRecord, body: io.BodyRecord) -> None:
     """Raise an InputError unless the garment lies on the body, and its own weights, if any, are for the body's joints."""
-    file = scene.path(scene.garment.file)
     if garment.weights is not None and garment.weights.shape[1] != len(body.parents):
         raise InputError(
             f"a weight for each of the body's {len(body.parents)} joints expected", file=file, field="blend_weights",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 
 import jax
 import numpy as np
 
 from ncs_jax import io
 from ncs_jax.energies.contact.beside import Beside
+from ncs_jax.energies.contact.layers import Upper
 from ncs_jax.energies.contact.points import contact_points
 from ncs_jax.energies.contact.surface import Surface, compact_groups, surface_from
 from ncs_jax.geometry.enclosure import ENCLOSED, beside, enclosure, facing
@@ -29,6 +31,7 @@ __all__ = [
     "touchable_faces",
     "touchable_part",
     "turned_away",
+    "uppers_of",
 ]
 
 SAMPLES = 64  # vertices of a garment, at least, of which the nearest to skin beside it tells where its inside is
@@ -140,11 +143,33 @@ def surface_of(
     """
     poses = []
     if track is not None:
-        frames = np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
-        poses = list(zip(*map(np.asarray, _worn(model, track.matrices[frames])), strict=True))
+        poses = list(zip(*map(np.asarray, _worn(model, track.matrices[_spread(track, samples)])), strict=True))
     rest, body = np.asarray(model.garment.mesh.rest), resting_body(model)
     points = contact_points(np.asarray(model.garment.mesh.faces), pieces) if pieces.size else None
     return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)
+
+
+def uppers_of(model: Model, firsts: Sequence[int], track: MotionFeatures | None, samples: int = 8) -> tuple[Upper, ...]:
+    """Return the garments of one mesh that are over others of it, each with the surface of all those below, facing outward.
+
+    firsts: the first vertex of each, from the skin outwards, but for the innermost.
+    """
+    rest, faces = np.asarray(model.garment.mesh.rest), np.asarray(model.garment.mesh.faces)
+    starts = np.array([0, *firsts, len(rest)])
+    faces = np.concatenate(
+        [
+            some if facing(rest[first:stop], some - first) > 0 else some[:, ::-1]
+            for first, stop in itertools.pairwise(starts)
+            for some in (faces[(faces[:, 0] >= first) & (faces[:, 0] < stop)],)
+        ]
+    )
+    poses: Iterable[np.ndarray] = () if track is None else np.asarray(_worn(model, track.matrices[_spread(track, samples)])[0])
+    found = []
+    for first, stop in itertools.pairwise(starts[1:]):
+        below = faces[faces[:, 0] < first]
+        posed = [(x[first:stop], x[:first]) for x in poses]
+        found.append(Upper(surface_from(rest[first:stop], rest[:first], below, posed=posed), int(first), int(stop)))
+    return tuple(found)
 
 
 def beside_of(model: Model) -> Beside | None:
@@ -159,6 +184,11 @@ def beside_of(model: Model) -> Beside | None:
     dtype, put = np.asarray(model.basis).dtype, jax.device_put  # from the host: nothing to compile
     weights = Blend(put(np.asarray(model.blend.weights)[some]), model.blend.joints)
     return Beside(put(found.astype(np.int32)), put(rest[some].astype(dtype)), put(outward[some].astype(dtype)), weights)
+
+
+def _spread(track: MotionFeatures, samples: int) -> np.ndarray:
+    """Return the numbers of some frames, spread evenly."""
+    return np.unique(np.linspace(0, len(track.start) - 1, samples).astype(int))
 
 
 @jax.jit

@@ -96,4 +96,5 @@ def with_smooth_contact(assembly: Assembly, track: MotionFeatures | None = None)
         return model
     faces, pieces = touchable_faces(model, assembly.body, assembly.prepared.part), assembly.prepared.pieces
     surface = surface_of(model, faces, track, smooth=True, pieces=pieces)
-    return replace(model, terms=replace(model.terms, collision="smooth"), surface=surface)
+    layers = model.terms.layers and "triangle"  # which converges too
+    return replace(model, terms=replace(model.terms, collision="smooth", layers=layers), surface=surface)

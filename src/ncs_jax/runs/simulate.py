@@ -89,7 +89,8 @@ def _turned(model: Model, turn) -> Array:
     """Return how far stretch, bending and pins of a garment that is only turned are out of balance, g: rounding alone."""
     garment, rest = model.garment, model.garment.mesh.rest
     transforms = jnp.broadcast_to(jnp.pad(turn, ((0, 0), (0, 1))), (len(rest), 3, 4))
-    terms = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, self_contact=False, own=())
+    alone = replace(model.terms, collision=None, friction=False, gravity=False, inertia=False, own=())
+    terms = replace(alone, self_contact=False, layers=None)
 
     def energy(x):
         step = StepInputs(vertex_transforms=transforms)

@@ -91,6 +91,9 @@ class GarmentSpec:
     pins: str = _f("", "name of the vertex group that is pinned; empty: none")
     learn_weights: bool = _f(False, "train the skinning weights too")
     over: tuple[str, ...] = _f((), "run folders of trained garments worn below this one; they collide as part of the body")
+    layers: tuple[str, ...] = _f(
+        (), "garment meshes worn over `file`, outwards: one model with it, in which each feels the others"
+    )
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -315,7 +318,8 @@ class Scene:
 
         tables["body"] |= {name: absolute(tables["body"][name]) for name in ("file", "mesh")}
         tables["garment"]["file"] = absolute(tables["garment"]["file"])
-        tables["garment"]["over"] = [absolute(name) for name in tables["garment"]["over"]]
+        for each in ("over", "layers"):
+            tables["garment"][each] = [absolute(name) for name in tables["garment"][each]]
         own, _, _ = (tables["motion"].pop(name) for name in ("own", "found", "lone"))
         for key in LISTS:
             given = [(name, split_frames(name)[0]) for name in tables["motion"][key]]

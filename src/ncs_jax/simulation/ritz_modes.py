@@ -53,7 +53,7 @@ def _couplings(model: Model) -> Couplings:
 
 def _still(model: Model, couplings: Couplings, matrices: Array) -> tuple[Problem, Array]:
     """The garment in a pose, seen from the root joint, which no past moves; and its skinning transforms."""
-    model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False))
+    model = replace(model, terms=replace(model.terms, inertia=True, friction=False, self_contact=False, layers=None))
     step, transforms = _posed(model, matrices)
     return Problem(model, couplings, None, step), transforms
 

@@ -65,6 +65,7 @@ class Animation:
     Attributes:
         garment: vertices (frames, verts, 3), m. garment_faces: (faces, 3). fps: frames per second.
         body: of as many frames, or None. up: the world's up, as three numbers; its length does not matter.
+        layers: the first vertex of each garment but the innermost, of several worn together; each has a colour of its own.
         checker: the garment at rest (verts, 3), m: its cloth is drawn in squares, which show strain and sliding; else None.
 
     Raises:
@@ -77,6 +78,7 @@ class Animation:
     body: PosedBody | None = None
     up: Sequence[float] = (0.0, 1.0, 0.0)
     checker: np.ndarray | None = None
+    layers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what was given."""

@@ -49,9 +49,12 @@ def animation_of(assembly: Assembly, motion: io.MotionRecord | None, vertices: n
     if body is not None and body.frames is not None:
         every = max(1, round(len(body.frames) / len(vertices)))  # of the substeps
         worn_on = PosedBody(body.frames[::every], body.faces)
-        return Animation(vertices, assembly.garment.faces, assembly.model.fps / every, worn_on, up)
+        return Animation(
+            vertices, assembly.garment.faces, assembly.model.fps / every, worn_on, up, layers=assembly.garment.layers
+        )
     given = required(motion, "motion", "give the one that the garment was animated over")
-    return Animation(vertices, assembly.garment.faces, assembly.model.fps, posed_body(assembly, given), up)
+    garment, fps = assembly.garment, assembly.model.fps
+    return Animation(vertices, garment.faces, fps, posed_body(assembly, given), up, layers=garment.layers)
 
 
 def posed_body(assembly: Assembly, motion: io.MotionRecord) -> PosedBody | None:

@@ -23,6 +23,7 @@ TERMS = {
     "friction": "#7fb2d9",
     "self_contact": "#2b4f81",
     "untangling": "#4f9fa3",
+    "layers": "#a3b541",
     "gravity": "#5d9a54",
     "inertia": "#c79a2b",
     "pinning": "#7a7470",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ from ncs_jax.view.character import posed_body
 __all__ = ["COLOURS", "AnimatedGarment", "View", "animated_garment", "colour_bins", "vertex_values", "view"]
 
 CLOTH, SKIN, WORN, OTHER = (221, 91, 49), (176, 168, 160), (128, 153, 178), (70, 130, 180)
+OVER = (92, 135, 145), (217, 186, 115)  # garments over the innermost, in turn
 BINS = 16  # colours of a scale
 THROUGH = "inside the body, or through it or the cloth"  # vertices, and those of triangles that another one passes through
 # What a colour can measure: its unit and the value at the scale's end.
@@ -195,7 +197,12 @@ class View:
         self.server.initial_camera.look_at = (0.0, low + 0.5 * tall, 0.0)
         self.server.initial_camera.fov = np.radians(40)
         mesh = functools.partial(scene.add_mesh_simple, side="double")
-        self.cloth = mesh("/garment", rest, self.faces, color=CLOTH)
+        starts = (0, *self.subject.run.assembly.garment.layers, len(rest))
+        self.cloths = []  # garments worn together: their vertices, and what shows them
+        for k, (first, stop) in enumerate(itertools.pairwise(starts)):
+            own = self.faces[(first <= self.faces[:, 0]) & (self.faces[:, 0] < stop)] - first
+            colour = CLOTH if not k else OVER[(k - 1) % len(OVER)]
+            self.cloths.append((slice(first, stop), mesh(f"/garment/{k}", rest[first:stop], own, color=colour)))
         posed = self._posed_body(self.subject.motions[0])
         self.body_meshes = []  # the body and the garments below: their vertices, and what shows them
         if posed is not None:
@@ -273,8 +280,9 @@ class View:
             self.other.visible = other is not None
             if other is not None:
                 self.other.vertices = other[frame] - middle
-            self.cloth.visible = self.colour.value == "cloth"
-            self.cloth.vertices = x - middle
+            for part, drawn in self.cloths:
+                drawn.visible = self.colour.value == "cloth"
+                drawn.vertices = x[part] - middle
             self.caption.content = self._coloured(x - middle, frame, other)
             if self.playing.value:
                 self.scrub.value = frame

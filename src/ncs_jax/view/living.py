@@ -82,7 +82,7 @@ def write_living_page(
     check_name(file)
     garment, model = run.assembly.garment, run.assembly.model
     scene: dict[str, object] = {"fps": float(model.fps), "frames": len(record.poses), "labels": []}
-    scene["garment"] = {"verts": len(garment.vertices)}
+    scene["garment"] = {"verts": len(garment.vertices), "layers": garment.layers}
     parts = {"script": runtime.script, "module": runtime.module, "wasm": runtime.wasm}
     data = {"garment-faces": stored_faces(garment.faces)} | {
         f"runtime-{name}": deflated(part, 9) for name, part in parts.items()

@@ -26,7 +26,7 @@ from ncs_jax.view.animation import upright, upright_axes
 from ncs_jax.view.camera import Camera
 from ncs_jax.view.ground import Ground
 from ncs_jax.view.heading import heading, trunk_axes, up_of
-from ncs_jax.view.pictures import BODY, CLOTH, CLOTH_INSIDE, FAINT, INK, WORN
+from ncs_jax.view.pictures import BODY, FAINT, INK, WORN, garment_colours
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
 __all__ = ["motion_sheet", "posed"]
@@ -84,11 +84,12 @@ def _motion_row(title: str, setting: Setting, record: MotionRecord) -> Image.Ima
     wide = 1.1 * max(
         float(np.ptp(x @ (math.cos(a), 0.0, -math.sin(a)))) for x, a in zip(skin, np.radians(azimuths), strict=True)
     )
+    colours = garment_colours(garment.layers, len(garment.vertices))
     for column in range(columns):
         middle = (skin[column].min(0) + skin[column].max(0)) / 2
         target = np.array([middle[0], (low + high) / 2, middle[2]])
         camera = Camera(target, tall, wide, azimuths[column], elevation=7.0)
-        meshes = [DrawnMesh(skin[column], body.faces, BODY), DrawnMesh(cloth[column], garment.faces, CLOTH, CLOTH_INSIDE)]
+        meshes = [DrawnMesh(skin[column], body.faces, BODY), DrawnMesh(cloth[column], garment.faces, *colours)]
         meshes += [DrawnMesh(upright(x, up), faces, WORN) for x, faces in _worn_below(setting, matrices[column])]
         ground = Ground(floor, (float(middle[0]), float(middle[2])), 0.3 * tall, cell=0)
         place = (MARGIN + column * width, TITLE)

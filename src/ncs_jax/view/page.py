@@ -108,7 +108,7 @@ def _scene(animations: dict[str, Animation]) -> Encoded:
     tracks = [stored_track(each.garment) for each in animations.values()]
     data = {f"track-{i}": payload for i, (_, payload) in enumerate(tracks)}
     scene: dict[str, object] = {"fps": float(first.fps), "frames": frames, "labels": list(animations)}
-    scene["garment"] = {"verts": verts, "tracks": [record for record, _ in tracks]}
+    scene["garment"] = {"verts": verts, "layers": first.layers, "tracks": [record for record, _ in tracks]}
     data["garment-faces"] = stored_faces(first.garment_faces)
     if first.body is not None:
         record, data["track-body"] = stored_track(first.body.vertices)

@@ -24,13 +24,14 @@ from ncs_jax.view.ground import Ground
 from ncs_jax.view.heading import heading
 from ncs_jax.view.rasteriser import PAPER, DrawnMesh, render
 
-__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet", "drawn_frames"]
+__all__ = ["FAINT", "INK", "VIEWS", "animation_gif", "contact_sheet", "drawn_frames", "garment_colours"]
 
 _ROWS = ("front", "side")
 VIEWS = {"front": 0.0, "three-quarter": 35.0, "side": 90.0, "back": 180.0}
 """Azimuth of a named view in degrees, turning from +Z, which characters face, towards +X."""
 
 CLOTH, CLOTH_INSIDE = (0.90, 0.47, 0.33), (0.55, 0.25, 0.28)
+OVER = (0.36, 0.53, 0.57), (0.85, 0.73, 0.45)  # of garments over it, in turn
 BODY, WORN = (0.80, 0.765, 0.73), (0.50, 0.60, 0.70)
 INK, FAINT = (46, 42, 40), (142, 135, 128)
 TOGETHER = 16  # frames of an animation that are in memory, drawn
@@ -51,7 +52,8 @@ class _Stage:
 
     def meshes(self, frame: int) -> list[DrawnMesh]:
         garment, body = self.animation.garment[frame], self.animation.body
-        drawn = [DrawnMesh(garment, self.animation.garment_faces, CLOTH, CLOTH_INSIDE, self.animation.checker)]
+        colours = garment_colours(self.animation.layers, len(garment))
+        drawn = [DrawnMesh(garment, self.animation.garment_faces, *colours, self.animation.checker)]
         if body is not None:
             x = body.vertices[frame]
             drawn.append(DrawnMesh(x, body.faces, np.repeat([BODY, WORN], [len(x) - body.worn, body.worn], axis=0)))
@@ -88,6 +90,18 @@ class _Stage:
         size = np.minimum(high - low, 6.0)
         y = np.clip(points[:, 1], self.floor - 1.0, self.floor + 6.0)
         return turn.T @ (low + high) / 2, min(float(y.min()), self.floor), float(y.max()), float(size[0])
+
+
+def garment_colours(layers: Sequence[int], verts: int) -> tuple[Sequence[float] | np.ndarray, Sequence[float] | None]:
+    """Return a garment's colours outside, of all or by vertex (verts, 3), and inside; None: as outside.
+
+    layers: the first vertex of each garment that is over the innermost.
+    """
+    if not layers:
+        return CLOTH, CLOTH_INSIDE
+    ends = np.array([*layers, verts])
+    shades = [CLOTH, *(OVER[k % len(OVER)] for k in range(len(layers)))]
+    return np.repeat(shades, np.diff(ends, prepend=0), axis=0), None
 
 
 def _drawable(vertices):

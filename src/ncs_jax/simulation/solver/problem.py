@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact import self_contact
+from ncs_jax.energies.contact.layers import layer_blocks
 from ncs_jax.energies.contact.pairs import Pairs, nearby_pairs
 from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.safe_steps import free_share, swept_share
@@ -239,6 +240,8 @@ def stiffness_blocks(problem: Problem, x: Float[Array, "verts 3"], point: Point)
     if point.repulsion is not None:
         stiff = required(model.material.self_contact, "material.self_contact")
         diagonal = diagonal + self_contact.blocks(point.repulsion, x, stiff)
+    if problem.terms.layers:
+        diagonal = diagonal + layer_blocks(x, model.garment.uppers, model.material.thickness, model.material.collision)
     return diagonal + weight[:, None, None] * jnp.eye(3, dtype=x.dtype)[None], off
 
 

@@ -1,0 +1,51 @@
+"""Garments that are worn together, as one mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ncs_jax.io.records import GarmentRecord
+
+__all__ = ["worn_together"]
+
+
+def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> GarmentRecord:
+    """Return garments, from the skin outwards, as one record: the vertices and triangles of the first, then of the next.
+
+    Vertex groups of one name become one; a group by its file's name ("shirt" of shirt.obj, "shirt 2" of a second) has all of
+    each garment. Texture coordinates and skinning weights are kept where all have some.
+
+    Args:
+        names: of their files. garments: in metres, Y up.
+    """
+    count = np.cumsum([0, *(len(g.vertices) for g in garments)])
+    groups: dict[str, list[np.ndarray]] = {}
+    for first, garment in zip(count, garments, strict=False):
+        for group, vertices in garment.groups.items():
+            groups.setdefault(group, []).append(first + vertices)
+    for first, stop, name in zip(count, count[1:], names, strict=False):
+        own = Path(name).stem.removeprefix("ncs:")
+        same = sum(taken == own or taken.startswith(f"{own} ") for taken in groups)
+        groups[f"{own} {same + 1}" if same else own] = [np.arange(first, stop)]
+    uv, weights = ([getattr(g, what) for g in garments] for what in ("uv", "weights"))
+    skinned = all(w is not None for w in weights)
+    notes = [note for g in garments for note in g.notes]
+    if not skinned and any(w is not None for w in weights):
+        notes.append("the garments' own skinning weights are not used: not all of them have some")
+    inner = garments[0]
+    return GarmentRecord(
+        np.concatenate([g.vertices for g in garments]),
+        np.concatenate([first + g.faces for first, g in zip(count, garments, strict=False)]).astype(np.int32),
+        np.concatenate(uv) if all(each is not None for each in uv) else None,
+        {name: np.concatenate(parts).astype(np.int32) for name, parts in groups.items()},
+        inner.scale,
+        inner.up,
+        sum(g.welded for g in garments),
+        np.concatenate(weights) if skinned else None,
+        inner.joint_names if skinned else (),
+        tuple(notes),
+        tuple(int(first) for first in count[1:-1]),
+    )
