@@ -12,6 +12,7 @@ from ncs_jax.cli import main
 from ncs_jax.energies.contact.layers import Upper, layer_blocks, layers
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.io import GarmentRecord, worn_together
+from ncs_jax.runs.outside import outside_body
 from ncs_jax.view.character import animation_of
 from ncs_jax.view.pictures import CLOTH, OVER, _stage
 
@@ -147,6 +148,18 @@ def test_both_give_way_while_they_are_trained(folder, worn, plain_jax):
     parts = run.evaluate(motion)
     assert np.all(parts["layers"] >= 0) and parts["layer_penetrating"].shape == (24,)
     np.testing.assert_array_equal(load_run(folder / "run").animate(motion), run.animate(motion))
+
+
+def test_what_is_animated_is_put_outside_of_what_lies_below(worn, plain_jax):
+    """The lower half of the outer sleeve is 5 mm in the inner one at rest; it comes to 3 mm outside, the inner one stays."""
+    model, track, rest = worn.model, worn.track, np.asarray(worn.model.garment.mesh.rest)
+    x = outside_body(model, track, rest[None])
+    before, after = (measure(model, each, track, exact=False)["layer_depth_max"][0] for each in (rest[None], x))
+    assert before > 4 and after == 0
+    bare = dataclasses.replace(model, garment=dataclasses.replace(model.garment, uppers=()))
+    np.testing.assert_array_equal(x[0, :336], outside_body(bare, track, rest[None])[0, :336])
+    moved = np.linalg.norm(x[0, 336:] - rest[336:], axis=1)
+    assert 0.006 < moved.max() < 0.012 and moved[rest[336:, 1] > 0.62].max() == 0
 
 
 @pytest.mark.slow

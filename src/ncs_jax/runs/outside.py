@@ -33,9 +33,16 @@ def pushing(model: Model) -> Float[Array, "body"] | None:
 def outside(
     model: Model, skin: Float[Array, "body"], matrices: Float[Array, "joints 3 4 *poses"], x: Float[Array, "verts 3 *poses"]
 ) -> Float[Array, "verts 3 *poses"]:
-    """Return the garment put outside of the body by `put_outside`, to `MARGIN` of the contact's thickness, m."""
-    surface = required(model.surface, "model.surface")
-    return put_outside(x, pose_body(model, matrices), surface, skin, MARGIN * model.material.thickness)
+    """Return the garment put outside of the body by `put_outside`, to `MARGIN` of the contact's thickness, m.
+
+    Of garments worn together, each is then put outside of those below it, from the skin outwards.
+    """
+    surface, margin = required(model.surface, "model.surface"), MARGIN * model.material.thickness
+    x = put_outside(x, pose_body(model, matrices), surface, skin, margin)
+    for upper in model.garment.uppers:
+        lower, own, within = x[: upper.first], x[upper.first : upper.stop], (~upper.below.border).astype(x.dtype)
+        x = x.at[upper.first : upper.stop].set(put_outside(own, lower, upper.below, within, margin))
+    return x
 
 
 @jax.jit
