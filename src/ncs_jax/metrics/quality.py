@@ -16,9 +16,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import angles
-from ncs_jax.energies.contact.distance import nearest_distance
 from ncs_jax.energies.contact.intersections import intersecting
-from ncs_jax.energies.contact.layers import Upper
+from ncs_jax.energies.contact.layers import Upper, layer_distances
 from ncs_jax.energies.contact.pairs import Groups, groups_from
 from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.surface import Surface, surface_from
@@ -53,7 +52,10 @@ QUANTITIES = {
     "centre_penetrating": ("%", "triangles whose centre is inside the body"),
     "centre_depth_max": ("mm", "deepest penetration of a triangle's centre"),
     "self_intersecting": ("%", "triangles that pass through another one of the garment"),
-    "layer_penetrating": ("%", "vertices of garments worn over others that are inside one of these"),
+    "layer_penetrating": (
+        "%",
+        "vertices, and points of contact between them, of garments worn over others that are inside one of these",
+    ),
     "layer_depth_max": ("mm", "deepest penetration of a garment into one that is worn below it"),
     "body_intersecting": ("%", "triangles of the garment that one of the body passes through"),
     "skin_pixels": ("px", "pixels of six views in which skin shows through the garment that covers it at rest"),
@@ -151,8 +153,7 @@ def _layer_depths(uppers: tuple[Upper, ...], frames: _Frames) -> dict[str, Float
     """Measure how much of garments is inside others of the same mesh that are worn below them, by exact distance."""
 
     def one(x):
-        own = [nearest_distance(x[upper.first : upper.stop], x[: upper.first], upper.below) for upper in uppers]
-        depth = -jnp.concatenate(own)
+        depth = -jnp.concatenate([layer_distances(x, upper) for upper in uppers])
         return {"layer_penetrating": 100 * jnp.mean(depth > 0), "layer_depth_max": 1000 * jnp.maximum(jnp.max(depth), 0)}
 
     return lax.map(one, frames.seen_from_root()[0].x)

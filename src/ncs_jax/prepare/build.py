@@ -146,8 +146,9 @@ def build(
         model = replace(model, surface=surface_of(model, faces, track, smooth=smooth, pieces=prepared.pieces))
         if scene.physics.collision.distance == "plane":
             model = replace(model, beside=beside_of(model))
-    if model.terms.layers:
-        model = replace(model, garment=replace(model.garment, uppers=uppers_of(model, setting.garment.layers, track)))
+    if setting.garment.layers and model.surface is not None:
+        uppers = uppers_of(model, setting.garment.layers, track, prepared.pieces)
+        model = replace(model, garment=replace(model.garment, uppers=uppers))
     if scene.network.method == "ncs" and scene.network.cell == "swing" and model.terms.inertia:
         if not prepared.vibrations.size and not (automatic and track is None):  # found before to have none
             known = required(track, "vibrations", "train again into a new folder")

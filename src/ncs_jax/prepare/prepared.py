@@ -98,14 +98,15 @@ def check_made_from(prepared: Prepared, files: SceneFiles) -> None:
         return
     scene, found = files.scene, made_from(files)
     whole = scene.path(scene.garment.file), scene.path(scene.body.file)
+    garment = f"one of {', '.join((scene.garment.file, *scene.garment.layers))}" if scene.garment.layers else "garment"
     compared = [
-        ("rest", whole[0], "garment.file: vertices", "garment"),
+        ("rest", whole[0], "garment.file: vertices", garment),
         ("pins", whole[0], "garment.pins", "pins"),
         ("skin", whole[1], "body.file: joints and vertices", "body"),
     ]
     if len(prepared.faces):
         compared += [
-            ("faces", whole[0], "garment.file: faces", "garment"),
+            ("faces", whole[0], "garment.file: faces", garment),
             ("skin_faces", whole[1], "body.file: faces", "body"),
         ]
     for name, file, field_, what in compared:

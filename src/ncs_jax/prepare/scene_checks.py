@@ -119,7 +119,12 @@ def _mesh(a: Setting) -> Iterator[Risk]:
     if len(through := crossing_pairs(x, faces)):
         value = f"{len(through)} pairs of triangles, first {through[0, 0]} and {through[0, 1]}"
         kept = "a simulation keeps it so" if a.scene.training.untangling or a.model.terms.layers else "it stays so"
-        yield Risk("garment through itself at rest", value, kept, "ncs fit smooths small folds, else bring it apart")
+        mend = (
+            "fit the outer garment with a larger --clearance"
+            if a.garment.layers
+            else "ncs fit smooths small folds, else bring it apart"
+        )
+        yield Risk("garment through itself at rest", value, kept, mend)
     if twice := doubled(x, faces):
         mend = f"garment.weld = {TOGETHER:g}"
         yield Risk("vertices at one place", str(twice), "cloth comes apart there: they share no edge", mend)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ncs_jax import io
 from ncs_jax.errors import InputError, required
+from ncs_jax.geometry.enclosure import facing
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.prepare.constants import model_from
 from ncs_jax.prepare.garment_checks import check_body_size, check_on_body
@@ -26,7 +27,7 @@ from ncs_jax.prepare.skinning_weights import with_body_weights
 from ncs_jax.scene.model import Layer, Model
 from ncs_jax.scene.spec import Scene
 
-__all__ = ["RECURRENT", "Below", "Setting", "cell_of", "set_up", "with_cell"]
+__all__ = ["RECURRENT", "Below", "Setting", "cell_of", "read_worn", "set_up", "with_cell"]
 
 RECURRENT = 1 / 15  # s: the shortest time step that a recurrence, whose inertia is of its own past, is safely trained at
 Below = tuple[io.BodyRecord | None, Layer]  # a trained garment that is worn below, and the body that it was trained on
@@ -158,6 +159,11 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
         scene.there(person.file, "body.file")
     scene.there(spec.file, "garment.file")
     for i, name in enumerate(spec.layers):
+        if name in ("", "none", spec.file, *spec.layers[:i]):
+            raise InputError(
+                "another garment expected", file=scene.source, field=f"garment.layers[{i}]", value=name,
+                mend="name a file of its own for each that is worn over the first",
+            )  # fmt: skip
         scene.there(name, f"garment.layers[{i}]")
     if scene.moves_by_itself:
         body = moving_body(scene)
@@ -172,11 +178,26 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
         )
     if body is not None:
         check_body_size(scene.path(scene.body.file), body)
-    worn = [_read_garment(scene, name, body) for name in (spec.file, *spec.layers)]
-    garment = io.worn_together((spec.file, *spec.layers), worn) if spec.layers else worn[0]
+    garment = read_worn(scene, body)
     pins, layers = _pins(scene, garment), _layers(scene, body, below, dtype)
     mesh = mesh_from(garment.vertices, garment.faces, uv=garment.uv, dtype=dtype)
     return SceneFiles(scene, body, garment, mesh, pins, layers)
+
+
+def read_worn(scene: Scene, body: io.BodyRecord | None = None) -> io.GarmentRecord:
+    """Return the garment of a scene, or all of those worn together as one, facing outward; with a body, on it."""
+    names = scene.garment.file, *scene.garment.layers
+    worn = [_read_garment(scene, name, body) for name in names]
+    return worn[0] if len(worn) == 1 else io.worn_together(names, [_outward(garment) for garment in worn])
+
+
+def _outward(garment: io.GarmentRecord) -> io.GarmentRecord:
+    """Return a garment whose triangles face outward."""
+    if facing(garment.vertices, garment.faces) > 0:
+        return garment
+    uv = None if garment.uv is None else garment.uv[:, ::-1]
+    note = "its triangles face inward: they were turned, as those of garments worn together all face outward"
+    return replace(garment, faces=np.ascontiguousarray(garment.faces[:, ::-1]), uv=uv, notes=(*garment.notes, note))
 
 
 def _read_garment(scene: Scene, name: str, body: io.BodyRecord | None) -> io.GarmentRecord:

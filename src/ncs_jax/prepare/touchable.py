@@ -149,26 +149,22 @@ def surface_of(
     return surface_from(rest, body, faces, smooth=smooth, posed=poses, points=points)
 
 
-def uppers_of(model: Model, firsts: Sequence[int], track: MotionFeatures | None, samples: int = 8) -> tuple[Upper, ...]:
-    """Return the garments of one mesh that are over others of it, each with the surface of all those below, facing outward.
+def uppers_of(
+    model: Model, firsts: Sequence[int], track: MotionFeatures | None, pieces: np.ndarray, samples: int = 8
+) -> tuple[Upper, ...]:
+    """Return the garments of one mesh that are over others of it, each with the surface of all those below.
 
-    firsts: the first vertex of each, from the skin outwards, but for the innermost.
+    firsts: the first vertex of each, from the skin outwards, but for the innermost. pieces: see `surface_of`.
     """
     rest, faces = np.asarray(model.garment.mesh.rest), np.asarray(model.garment.mesh.faces)
-    starts = np.array([0, *firsts, len(rest)])
-    faces = np.concatenate(
-        [
-            some if facing(rest[first:stop], some - first) > 0 else some[:, ::-1]
-            for first, stop in itertools.pairwise(starts)
-            for some in (faces[(faces[:, 0] >= first) & (faces[:, 0] < stop)],)
-        ]
-    )
     poses: Iterable[np.ndarray] = () if track is None else np.asarray(_worn(model, track.matrices[_spread(track, samples)])[0])
     found = []
-    for first, stop in itertools.pairwise(starts[1:]):
-        below = faces[faces[:, 0] < first]
+    for first, stop in itertools.pairwise([*firsts, len(rest)]):
+        own = (first <= faces[:, 0]) & (faces[:, 0] < stop)
+        points = contact_points(faces[own] - first, pieces[own]) if pieces.size else None
         posed = [(x[first:stop], x[:first]) for x in poses]
-        found.append(Upper(surface_from(rest[first:stop], rest[:first], below, posed=posed), int(first), int(stop)))
+        below = surface_from(rest[first:stop], rest[:first], faces[faces[:, 0] < first], posed=posed, points=points)
+        found.append(Upper(below, int(first), int(stop)))
     return tuple(found)
 
 

@@ -20,7 +20,7 @@ from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.network.methods.choose import network_from
 from ncs_jax.prepare.build import SWING, Assembly, check_terms, vibrations_of
 from ncs_jax.prepare.prepared import Prepared
-from ncs_jax.prepare.setting import set_up
+from ncs_jax.prepare.setting import read_worn, set_up
 from ncs_jax.prepare.skinning_weights import used_joints
 from ncs_jax.runs.checkpoint import Checkpoints, check_writable, read_prepared, read_run
 from ncs_jax.runs.run import NetworkMaker, Run, check_own, load_run
@@ -233,13 +233,12 @@ def _assemble_started(
 
 def _check_garment(name: str, before: Assembly, scene: Scene) -> None:
     """Raise an InputError where a scene has a garment of other triangles than a run: before anything is made ready."""
-    spec = scene.garment
-    given = io.read_garment(scene.path(spec.file), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    given, (kept, new) = read_worn(scene), (", ".join((s.garment.file, *s.garment.layers)) for s in (before.scene, scene))
     if not np.array_equal(before.garment.faces, given.faces):
-        kept = f"{before.scene.garment.file} with {len(before.garment.faces)} triangles"
+        kept = f"{kept} with {len(before.garment.faces)} triangles"
         raise InputError(
             f"the garment of {name} expected, {kept}, which its weights are for", file=scene.source, field="garment.file",
-            value=f"{spec.file}, {len(given.faces)} triangles", mend="train this garment anew, without --from",
+            value=f"{new}, {len(given.faces)} triangles", mend="train this garment anew, without --from",
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,13 +29,17 @@ def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> Ga
             groups.setdefault(group, []).append(first + vertices)
     for first, stop, name in zip(count, count[1:], names, strict=False):
         own = Path(name).stem.removeprefix("ncs:")
-        same = sum(taken == own or taken.startswith(f"{own} ") for taken in groups)
-        groups[f"{own} {same + 1}" if same else own] = [np.arange(first, stop)]
+        free = (f"{own} {k}" if k > 1 else own for k in itertools.count(1))
+        groups[next(name for name in free if name not in groups)] = [np.arange(first, stop)]
     uv, weights = ([getattr(g, what) for g in garments] for what in ("uv", "weights"))
     skinned = all(w is not None for w in weights)
     notes = [note for g in garments for note in g.notes]
     if not skinned and any(w is not None for w in weights):
         notes.append("the garments' own skinning weights are not used: not all of them have some")
+    if any(each is not None for each in uv) and (
+        bare := next((n for n, each in zip(names, uv, strict=True) if each is None), "")
+    ):
+        notes.append(f"texture coordinates are not used: {bare} has none")
     inner = garments[0]
     return GarmentRecord(
         np.concatenate([g.vertices for g in garments]),
