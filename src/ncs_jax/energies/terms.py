@@ -138,7 +138,7 @@ class Material:
 class Garment:
     """What a garment is to the energies: its mesh, which vertices are pinned, its groups where it looks for itself.
 
-    uppers: the garments of the mesh that are worn over others of it, where these touch as layers.
+    uppers: of garments worn together, those that are over others, from the skin outwards.
     """
 
     mesh: Mesh
