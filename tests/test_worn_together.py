@@ -1,6 +1,7 @@
 """Garments that are worn together, as one model in which each feels the others."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from ncs_jax import InputError, assemble, load_run, load_scene, measure, simulat
 from ncs_jax.cli import main
 from ncs_jax.energies.contact.layers import Upper, layer_blocks, layers
 from ncs_jax.energies.contact.surface import surface_from
-from ncs_jax.io import GarmentRecord, worn_together
+from ncs_jax.io import GarmentRecord, read_animation, worn_together
 from ncs_jax.runs.outside import outside_body
 from ncs_jax.view.character import animation_of
 from ncs_jax.view.pictures import CLOTH, OVER, _stage
@@ -187,6 +188,12 @@ def test_both_give_way_while_they_are_trained(folder, worn, plain_jax):
     np.testing.assert_array_equal(load_run(folder / "run").animate(motion), run.animate(motion))
     on = train(worn.scene, folder / "on", start=folder / "run", steps=1, report=None)
     assert on.steps == 1
+    assert main(["animate", str(folder / "run"), "--as-trained", "--out", str(folder / "swing.pc2")]) == 0
+    for name, own in (("inner", np.s_[:, :336]), ("outer", np.s_[:, 336:])):
+        np.testing.assert_array_equal(read_animation(folder / f"swing_{name}.pc2").vertices, run.animate(motion)[own])
+    run.export(folder / "step.onnx")
+    inner, outer = json.loads((folder / "step.onnx.json").read_text())["garments"]
+    assert inner == {"name": "inner", "first": 0, "vertices": 336} and outer["first"] == outer["vertices"] == 336
     one = dataclasses.replace(worn.scene, garment=dataclasses.replace(worn.scene.garment, layers=()))
     with pytest.raises(InputError, match=r"inner.npz, .*outer.npz with 1248 triangles, which .*found 'inner.npz, 624"):
         train(one, folder / "one", start=folder / "run", steps=1)

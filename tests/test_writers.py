@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.animation.glb import write_glb
 from ncs_jax.io.mesh import usd
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.objects import objects_of
 
 from . import characters
 from .shapes import tube
@@ -234,7 +236,7 @@ def test_no_other_format_holds_a_body(tmp_path):
 def test_a_glb_that_its_format_cannot_hold(tmp_path):
     huge = np.broadcast_to(np.float32(0), (50_000, 4_000, 3))
     with pytest.raises(InputError, match=r"a\.glb: vertices: at most 4294967295 bytes.*\.usdc"):
-        write_glb(tmp_path / "a.glb", huge, np.array([[0, 1, 2]], np.int32), 30)
+        write_glb(tmp_path / "a.glb", objects_of(["shirt"], (), huge, huge[0], np.array([[0, 1, 2]], np.int32), None), 30)
     assert not list(tmp_path.iterdir())
 
 
@@ -363,3 +365,62 @@ def test_normals_of_a_tube_point_outward_and_those_of_nothing_up():
     radial = rest * [1, 0, 1] / np.linalg.norm(rest * [1, 0, 1], axis=1, keepdims=True)
     assert (np.sum(n * radial, axis=1) > 0.99).all()
     np.testing.assert_array_equal(vertex_normals(np.zeros((3, 3)), np.array([[0, 1, 2]])), [[0, 1, 0]] * 3)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".usdc", ".usda"])
+def test_garments_worn_together_are_objects_with_names(suffix, tmp_path):
+    """Blender lists each; the whole read back is the animation, vertex by vertex."""
+    x, faces, uv = together()
+    names = ("shirt", "coat 2", "hero")
+    (file,) = io.write_animation(tmp_path / f"a{suffix}", x, faces, 24, uv=uv, names=names, layers=(3,))
+    assert file == tmp_path / f"a{suffix}"
+    if suffix == ".glb":
+        data = file.read_bytes()
+        document = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+        assert [mesh["name"] for mesh in document["meshes"]] == ["shirt", "coat 2"]
+        assert len({str(m["pbrMetallicRoughness"]["baseColorFactor"]) for m in document["materials"]}) == 2
+        counts = [document["accessors"][m["primitives"][0]["attributes"]["POSITION"]]["count"] for m in document["meshes"]]
+        assert counts == [3, 4]
+    else:
+        found = io.read_animation(file)
+        np.testing.assert_allclose(found.vertices, x)
+        np.testing.assert_array_equal(found.faces, faces)
+        np.testing.assert_allclose(io.read_garment(file, mesh=["coat_2"]).vertices, x[0, 3:])
+
+
+@pytest.mark.parametrize("suffix", [".pc2", ".mdd"])
+def test_a_cache_of_each_garment(suffix, tmp_path):
+    x, faces, _ = together()
+    files = io.write_animation(tmp_path / f"a{suffix}", x, faces, 24, names=("shirt", "coat 2", "hero"), layers=(3,))
+    assert [file.name for file in files] == [f"a_shirt{suffix}", f"a_coat_2{suffix}"]
+    assert sorted(tmp_path.iterdir()) == sorted(files)
+    for file, own in zip(files, (x[:, :3], x[:, 3:]), strict=True):
+        np.testing.assert_allclose(io.read_animation(file).vertices, own)
+
+
+def test_frames_of_garments_worn_together(tmp_path):
+    x, faces, uv = together()
+    io.write_animation(tmp_path / "frames", x, faces, 24, uv=uv, names=("shirt", "coat", "hero"), layers=(3,))
+    lines = (tmp_path / "frames" / "frame_0001.obj").read_text().splitlines()
+    assert [line[:6] for line in lines if line[0] in "of"] == ["o shir", "f 1/1 ", "o coat", *(["f 4/4 ", "f 4/4 "])]
+    found = io.read_animation(tmp_path / "frames", fps=24)
+    np.testing.assert_allclose(found.vertices, x, rtol=1e-6)
+    np.testing.assert_array_equal(found.faces, faces)
+
+
+def test_arrays_tell_where_each_garment_begins(tmp_path):
+    x, faces, _ = together()
+    for name in ("a.npz", "a.h5"):
+        io.write_animation(tmp_path / name, x, faces, 24, names=("shirt", "coat", "hero"), layers=(3,))
+        np.testing.assert_allclose(io.read_animation(tmp_path / name).vertices, x)
+    assert np.load(tmp_path / "a.npz")["layers"].tolist() == [3]
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["layers"][()].tolist() == [3]
+
+
+def together():
+    """A triangle and a square over it, moving apart in three frames, with texture coordinates."""
+    still = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float32)
+    x = still + np.linspace(0, 1, 3, dtype=np.float32)[:, None, None] * (still[:, 2:] + 1)
+    faces = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 6]], np.int32)
+    return x, faces, still[faces][..., :2] + still[faces][..., 2:]

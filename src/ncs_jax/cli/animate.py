@@ -116,12 +116,11 @@ def animate(options) -> int:
         print(f"{options.out}: {len(vertices)} frames at {fps:g} per second{error}")
         return 0
     names = arguments.mesh_names(run.assembly.scene)
-    io.write_animation(
-        options.out, vertices, garment.faces, fps, rest=garment.vertices, uv=garment.uv, worn_by=worn_by, names=names
+    more = {"rest": garment.vertices, "uv": garment.uv}
+    files = io.write_animation(
+        options.out, vertices, garment.faces, fps, **more, worn_by=worn_by, names=names, layers=garment.layers
     )
-    print(f"{options.out}: {len(vertices)} frames at {fps:g} per second, {vertices.shape[1]} vertices{error}")
-    if suffix in (".pc2", ".mdd"):
-        print(arguments.BLENDER)
+    arguments.tell_written(files, len(vertices), fps, (*garment.layers, vertices.shape[1]), error)
     if worn_by is not None and worn_by[0].posedirs is not None:
         print("  note: the body is written without its pose correctives; skin may show by as much as they move it")
     return 0

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ __all__ = [
     "mesh_names",
     "positive",
     "seed",
+    "tell_written",
     "whole",
 ]
 
@@ -151,7 +152,22 @@ def check_scene_kept(out: str, scene, *motions: str) -> None:
     """Raise an InputError where a file that is to be written is one that a scene, or a motion beside it, is read from."""
     given = scene.body.file, scene.body.mesh, scene.garment.file, *scene.garment.over, *scene.garment.layers, *scene.motions
     own = [scene.path(name) for name in given if name not in ("", "none") and not name.startswith("ncs:")]
-    check_not_read(out, *filter(None, [scene.source]), *own, *motions)
+    files: tuple[str | Path, ...] = (out,)
+    if scene.garment.layers:
+        from ncs_jax.io.animation.animation import animation_files
+
+        files = animation_files(out, mesh_names(scene)[:-1])
+    for file in files:
+        check_not_read(str(file), *filter(None, [scene.source]), *own, *motions)
+
+
+def tell_written(files: Sequence[Path], frames: int, fps: float, ends: Sequence[int], more: str = "") -> None:
+    """Print what was written: of garments in a file each, up to which vertex each goes; and how Blender reads a Mesh Cache."""
+    first = (0, *ends[:-1]) if len(files) > 1 else (0,)
+    for file, start, end in zip(files, first, ends[-len(files) :], strict=True):
+        print(f"{file}: {frames} frames at {fps:g} per second, {end - start} vertices{more}")
+    if files[0].suffix.lower() in (".pc2", ".mdd"):
+        print(BLENDER)
 
 
 def check_run(folder: str) -> None:
@@ -220,10 +236,13 @@ def body_table(options, folder: Path) -> str:
     return "\n".join(lines)
 
 
-def mesh_names(scene) -> tuple[str, str]:
-    """Return what garment and body of a scene are called where a file names its meshes: as their own files, if these differ."""
-    garment, body = (Path(part.file.removeprefix("ncs:")).stem for part in (scene.garment, scene.body))
-    return (garment, body) if garment != body else ("garment", "body")
+def mesh_names(scene) -> tuple[str, ...]:
+    """Return what a scene's garments and body are called where a file names its meshes: as their own files, if these differ."""
+    from ncs_jax.io.mesh.joined import garment_names
+
+    garments = garment_names((scene.garment.file, *scene.garment.layers))
+    (body,) = garment_names([scene.body.file])
+    return ("garment", "body") if garments == [body] else (*garments, "body" if body in garments else body)
 
 
 def positive(text: str, of: str = "") -> float:

@@ -37,7 +37,7 @@ def simulate(options) -> int:
     from ncs_jax.io.animation.animation import animation_suffix
     from ncs_jax.runs import simulate as runs_simulate
 
-    suffix = animation_suffix(options.out, with_body=options.body)  # before hours are spent on frames that cannot be written
+    animation_suffix(options.out, with_body=options.body)  # before hours are spent on frames that cannot be written
     arguments.check_scene_kept(options.out, scene, *filter(None, [options.motion]))
     partial = Path(f"{str(options.out).rstrip('/')}.partial.npz")
     with WorkProgress("reading the scene") as progress:
@@ -54,11 +54,9 @@ def simulate(options) -> int:
     names, x, fps = arguments.mesh_names(scene), result.vertices, result.fps
     worn_by = result.wearer() if options.body else None
     more = {"rest": garment.vertices, "uv": garment.uv}
-    io.write_animation(options.out, x, garment.faces, fps, **more, worn_by=worn_by, names=names)
+    files = io.write_animation(options.out, x, garment.faces, fps, **more, worn_by=worn_by, names=names, layers=garment.layers)
     partial.unlink(missing_ok=True)
-    print(f"{options.out}: {len(result.vertices)} frames at {result.fps:g} per second, {result.vertices.shape[1]} vertices")
-    if suffix in (".pc2", ".mdd"):
-        print(arguments.BLENDER)
+    arguments.tell_written(files, len(x), fps, (*garment.layers, x.shape[1]))
     precision = "double" if result.vertices.dtype == np.float64 else "single"
     print(
         f"  iterations a frame {np.mean(result.iterations):.1f}, residual at most {np.max(result.residual):.3g} g, "

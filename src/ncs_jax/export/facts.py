@@ -13,6 +13,7 @@ import numpy as np
 from ncs_jax.errors import InputError
 from ncs_jax.export.stablehlo import expiry
 from ncs_jax.export.step import Step
+from ncs_jax.io.mesh.joined import garment_names
 from ncs_jax.prepare.build import Assembly
 
 __all__ = ["FORMATS", "PAGES", "FileFormat", "host_facts"]
@@ -71,6 +72,7 @@ def host_facts(assembly: Assembly, step: Step, file: Path, format: FileFormat) -
         **(expiry(jax.__version__, date.today()) if format.name == "stablehlo" else {}),
         "fps": float(model.fps),
         "vertices": verts,
+        **_worn_together(assembly),
         "units": "metres, rotation matrices, float32",
         "axes": "right-handed, those of the body file: a host with left-handed ones mirrors what goes in and what comes out",
         "gravity": np.asarray(model.material.gravity, np.float64).round(6).tolist(),
@@ -93,3 +95,13 @@ def host_facts(assembly: Assembly, step: Step, file: Path, format: FileFormat) -
             )
         ],
     }
+
+
+def _worn_together(assembly: Assembly) -> dict:
+    """Return which vertices are whose, where several garments are one model."""
+    garment, spec = assembly.garment, assembly.scene.garment
+    if not garment.layers:
+        return {}
+    names, ends = garment_names((spec.file, *spec.layers)), (0, *garment.layers, len(garment.vertices))
+    parts = zip(names, ends, ends[1:], strict=False)
+    return {"garments": [{"name": name, "first": first, "vertices": end - first} for name, first, end in parts]}

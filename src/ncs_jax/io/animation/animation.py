@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ncs_jax.errors import InputError
-from ncs_jax.io.animation.glb import NAMES, write_glb
+from ncs_jax.io.animation.glb import write_glb
 from ncs_jax.io.animation.mdd import read_mdd, write_mdd
 from ncs_jax.io.animation.obj_folder import read_obj_folder
 from ncs_jax.io.animation.pc2 import read_pc2, write_pc2
 from ncs_jax.io.mesh.obj import format_obj, obj_faces
+from ncs_jax.io.mesh.objects import MovingObject, objects_of
 from ncs_jax.io.mesh.usd import USD, check_installed, read_usd_animation, write_usd
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import check_place, replacing, suffix_lacking
@@ -21,11 +23,12 @@ from ncs_jax.io.tables.hdf5 import read_hdf5, write_hdf5
 from ncs_jax.io.tables.npz import read_npz, write_npz
 from ncs_jax.io.tables.table import floats, indices
 
-__all__ = ["animation_suffix", "read_animation", "write_animation"]
+__all__ = ["animation_files", "animation_suffix", "read_animation", "write_animation"]
 
 FIELDS = ("vertices", "faces", "fps")
 READABLE = (".npz", ".h5", ".hdf5", ".pc2", ".mdd", *USD)
 FORMATS = (*READABLE, ".glb")
+ONE_OBJECT = (".pc2", ".mdd")
 
 
 def write_animation(
@@ -37,20 +40,25 @@ def write_animation(
     rest: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | AnimationRecord | None = None,
-    names: tuple[str, str] = NAMES,
-) -> None:
-    """Write a moving mesh in the format of the suffix; the file or folder appears whole or not at all.
+    names: Sequence[str] = ("garment", "body"),
+    layers: Sequence[int] = (),
+) -> tuple[Path, ...]:
+    """Write a moving mesh in the format of the suffix, and return the files; each file or folder appears whole or not at all.
 
     .npz and .h5 hold `vertices` (T, V, 3) float32, `faces` (F, 3) int32 and `fps`. .pc2 and .mdd hold the vertices only, in the
     given order, which is the garment file's: they can be put onto the mesh of that file. .glb plays in viewers, see
     `write_glb`. .usd, .usdc, .usda and .usdz hold the rest shape too, see `write_usd`. A path without a suffix, or one that
     ends in a slash, becomes a folder of frame_0000.obj and so on; it replaces only a folder of such files.
 
+    Garments that are worn together are objects with names of their own in .glb, USD and .obj; a .pc2 or .mdd holds one object,
+    so that NAME.pc2 becomes NAME_shirt.pc2 and NAME_coat.pc2; .npz and .h5 hold `layers` too.
+
     Args:
         path: the file to write; missing parent folders are made. vertices: (T, V, 3) m. faces: (F, 3). fps: frames per second.
         rest: (V, 3) m, the shape at rest, for USD; None: that of the first frame. uv: (F, 3, 2) texture coordinates of the
             triangles' corners, which .glb, USD and .obj hold and the other formats leave out. worn_by: the body and its motion
-            of T frames, or a body that is a moving mesh, to be written into a .glb too. names: of the mesh and the body there.
+            of T frames, or a body that is a moving mesh, to be written into a .glb too. names: of the mesh, or of each
+            garment, and of the body. layers: the first vertex of each garment but the first, as in a garment's record.
 
     Raises:
         InputError: the suffix is unknown or its format holds no body, the arrays do not fit together or are not finite, or the
@@ -64,21 +72,43 @@ def write_animation(
     if not 0 < float(fps) < np.inf:
         raise InputError("a number above 0 expected", file=file, field="fps", value=fps)
     maps = None if uv is None else floats(file, "uv", np.asarray(uv), (len(triangles), 3, 2), ("face", "corner"))
-    if suffix == ".npz":
-        write_npz(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
-    elif suffix == ".pc2":
-        write_pc2(file, x)
-    elif suffix == ".mdd":
-        write_mdd(file, x, float(fps))
+    at_rest = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
+    objects = objects_of(names[:-1], layers, x, at_rest, triangles, maps)
+    if suffix in (".npz", ".h5", ".hdf5"):
+        more = {"layers": np.asarray(layers, np.int32)} if len(layers) else {}
+        (write_npz if suffix == ".npz" else write_hdf5)(file, vertices=x, faces=triangles, fps=np.array(float(fps)), **more)
+    elif suffix in ONE_OBJECT:
+        files = animation_files(file, names[:-1])
+        for own, each in zip(files, objects, strict=True):
+            write_pc2(own, each.vertices) if suffix == ".pc2" else write_mdd(own, each.vertices, float(fps))
+        return files
     elif suffix == ".glb":
-        write_glb(file, x, triangles, float(fps), uv=maps, worn_by=worn_by, names=names)
+        write_glb(file, objects, float(fps), worn_by=worn_by, body=names[-1])
     elif suffix in USD:
-        given = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
-        write_usd(file, x, triangles, float(fps), given, maps)
-    elif suffix:
-        write_hdf5(file, vertices=x, faces=triangles, fps=np.array(float(fps)))
+        write_usd(file, objects, float(fps))
     else:
-        _write_folder(file, x, obj_faces(triangles, maps), float(fps))
+        _write_folder(file, x, _obj_lines(objects, triangles, maps), float(fps))
+    return (file,)
+
+
+def animation_files(path: str | Path, garments: Sequence[str]) -> tuple[Path, ...]:
+    """Return the files that an animation of garments becomes: one, but one each where the format holds a single object."""
+    file = Path(path)
+    if len(garments) == 1 or file.suffix.lower() not in ONE_OBJECT:
+        return (file,)
+    return tuple(file.with_name(f"{file.stem}_{name.replace(' ', '_')}{file.suffix}") for name in garments)
+
+
+def _obj_lines(objects: Sequence[MovingObject], faces: np.ndarray, uv: np.ndarray | None) -> str:
+    """Return the text of `obj_faces`; where there are several objects, the triangles of each after its name."""
+    lines = obj_faces(faces, uv).splitlines(keepends=True)
+    if len(objects) == 1:
+        return "".join(lines)
+    place = len(lines) - len(faces)  # after texture coordinates
+    for each in objects:
+        lines.insert(place, f"o {each.name}\n")
+        place += 1 + len(each.faces)
+    return "".join(lines)
 
 
 def animation_suffix(path: str | Path, *, with_body: bool = False, also: tuple[str, ...] = ()) -> str:

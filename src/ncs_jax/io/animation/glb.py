@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.objects import MovingObject
 from ncs_jax.io.mesh.weld import distinct
 from ncs_jax.io.records import AnimationRecord, BodyRecord, MotionRecord
 from ncs_jax.io.tables.files import replacing
 
-__all__ = ["NAMES", "write_glb", "write_glb_body"]
+__all__ = ["write_glb", "write_glb_body"]
 
 FLOAT, SHORT, INT = 5126, 5123, 5125  # glTF's codes for types of numbers
 VERTICES, INDICES = 34962, 34963  # glTF's codes for the use of a buffer view
@@ -25,26 +26,24 @@ SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LARGEST = 2**32 - 1  # bytes that the header can count
 DESCRIPTION = 1000  # bytes; the JSON of a frame or a joint takes less
 MOST = 8  # joints that move a vertex, as in the package's own skinning
-NAMES = "garment", "body"  # of the meshes, where no better ones are known
-CLOTH, SKIN = (0.32, 0.47, 0.65, 1.0), (0.78, 0.74, 0.7, 1.0)
+SKIN = 0.78, 0.74, 0.7
 
 
 def write_glb(
     path: str | Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    objects: Sequence[MovingObject],
     fps: float,
     *,
-    uv: np.ndarray | None = None,
     worn_by: tuple[BodyRecord, MotionRecord] | AnimationRecord | None = None,
-    names: tuple[str, str] = NAMES,
+    body: str = "body",
 ) -> None:
-    """Write a moving mesh that plays in any viewer of glTF; the file appears whole or not at all.
+    """Write moving meshes that play in any viewer of glTF; the file appears whole or not at all.
 
-    The mesh stands as in the first frame. Morph target k takes it to frame k, with its normals, in float32. At the time of
-    frame k the weight of target k is 1 and every other is 0, linear between (sampler LINEAR), so that vertices move in straight
-    lines between two frames. A frame takes 24 bytes a vertex, and the weights take 4 bytes times the frames squared: 32 MB and
-    0.4 MB for 300 frames of 4,500 vertices. The sum that a viewer makes equals the frame to rounding of float32.
+    Each is a mesh of its own, which stands as in the first frame. Morph target k takes it to frame k, with its normals, in
+    float32. At the time of frame k the weight of target k is 1 and every other is 0, linear between (sampler LINEAR), so that
+    vertices move in straight lines between two frames. A frame takes 24 bytes a vertex, and the weights of a mesh take 4 bytes
+    times the frames squared: 32 MB and 0.4 MB for 300 frames of 4,500 vertices. The sum that a viewer makes equals the frame to
+    rounding of float32.
 
     glTF holds one texture coordinate a vertex: at seams a vertex is written several times, with its one normal.
 
@@ -52,21 +51,22 @@ def write_glb(
     vertex are kept, the largest first, because some viewers know only the first 4.
 
     Args:
-        path: the file to write. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second.
-        uv: (F, 3, 2) texture coordinates of corners, v upward. worn_by: the body and its motion of T frames; or a body that is
-            a moving mesh, which is written as the garment is. names: of the garment and the body, as a modeller lists them.
+        path: the file to write. objects: at least one, float32, Y up, v of texture coordinates upward. fps: frames per second.
+        worn_by: the body and its motion of T frames; or a body that is a moving mesh, which is written as the garments are.
+        body: its name, as a modeller lists it.
 
     Raises:
         InputError: the file would be larger than 4 GiB, which the format cannot count, or it cannot be written.
     """
-    split = _split(vertices.shape[1], faces, uv)
-    frames, count = len(vertices), len(split.vertex)
-    size = 24 * frames * count + 4 * frames * frames + 4 * faces.size + DESCRIPTION * frames
+    moving, frames, size = list(objects), len(objects[0].vertices), 0
     if isinstance(worn_by, AnimationRecord):
-        size += 24 * worn_by.vertices.size // 3 + 4 * frames * frames + 4 * worn_by.faces.size + DESCRIPTION * frames
+        moving.append(MovingObject(body, SKIN, worn_by.vertices, worn_by.vertices[0], worn_by.faces, None))
     elif worn_by is not None:
-        body, motion = worn_by
-        size += 88 * len(body.vertices) + 4 * body.faces.size + 16 * motion.poses.size + DESCRIPTION * len(body.joints)
+        skin, motion = worn_by
+        size += 88 * len(skin.vertices) + 4 * skin.faces.size + 16 * motion.poses.size + DESCRIPTION * len(skin.joints)
+    parts = [(each, _split(each.vertices.shape[1], each.faces, each.uv)) for each in moving]
+    for each, split in parts:
+        size += 24 * frames * len(split.vertex) + 4 * frames * frames + 4 * each.faces.size + DESCRIPTION * frames
     if size > LARGEST:
         raise InputError(
             f"at most {LARGEST} bytes expected", file=path, field="vertices", value=f"{size} bytes",
@@ -74,19 +74,17 @@ def write_glb(
         )  # fmt: skip
     document = _Document()
     keys = None if frames == 1 else document.array((np.arange(frames) / fps).astype("<f4")[:, None], bounded=True)
-    _moving(document, names[0], vertices, faces, split, keys)
-    if isinstance(worn_by, AnimationRecord):
-        plain = _split(worn_by.vertices.shape[1], worn_by.faces, None)
-        _moving(document, names[1], worn_by.vertices, worn_by.faces, plain, keys, SKIN)
-    elif worn_by is not None:
-        _body(document, names[1], *worn_by, keys)
+    for each, split in parts:
+        _moving(document, each, split, keys)
+    if isinstance(worn_by, tuple):
+        _body(document, body, *worn_by, keys)
     _write(path, document)
 
 
 def write_glb_body(path: str | Path, body: BodyRecord) -> None:
     """Write a body at rest, as a skinned mesh on its joints; the file appears whole or not at all."""
     document, still = _Document(), np.zeros((1, len(body.joints), 3))
-    _body(document, NAMES[1], body, MotionRecord(still, still[:, 0], 1.0), None)
+    _body(document, "body", body, MotionRecord(still, still[:, 0], 1.0), None)
     _write(path, document)
 
 
@@ -145,7 +143,7 @@ class _Document:
 
     def mesh(self, name: str, primitive: dict, color: tuple[float, ...], **more) -> dict:
         """Add a mesh of one primitive, and a root node that it hangs on; return the mesh."""
-        metal = {"baseColorFactor": color, "metallicFactor": 0, "roughnessFactor": 0.9}
+        metal = {"baseColorFactor": (*color, 1.0), "metallicFactor": 0, "roughnessFactor": 0.9}
         self.materials.append({"name": name, "doubleSided": True, "pbrMetallicRoughness": metal})
         mesh = {"name": name, "primitives": [primitive | {"mode": 4, "material": len(self.materials) - 1}]}
         self.meshes.append(mesh)
@@ -198,16 +196,9 @@ def _split(count: int, faces: np.ndarray, uv: np.ndarray | None) -> _Split:
     return _Split(source, own, place[number].reshape(-1, 3))
 
 
-def _moving(
-    document: _Document,
-    name: str,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    split: _Split,
-    keys: int | None,
-    color: tuple[float, ...] = CLOTH,
-) -> None:
+def _moving(document: _Document, mesh: MovingObject, split: _Split, keys: int | None) -> None:
     """Add a moving mesh: its shape, a morph target for each later frame, and their weights over time."""
+    vertices, faces = mesh.vertices, mesh.faces
     frames, count = len(vertices), len(split.vertex)
 
     def shapes() -> Iterator[np.ndarray]:
@@ -236,12 +227,13 @@ def _moving(
         attributes[0]["TEXCOORD_0"] = document.array(split.uv.astype("<f4"), target=VERTICES)
     primitive = {"attributes": attributes[0], "indices": document.corners(split.faces, count)}
     if keys is None:
-        document.mesh(name, primitive, color)
+        document.mesh(mesh.name, primitive, mesh.colour)
         return
-    mesh, node = document.mesh(name, primitive | {"targets": attributes[1:]}, color), document.roots[-1]
-    mesh["extras"] = {"targetNames": [f"frame_{t:04}" for t in range(1, frames)]}
+    shown = document.mesh(mesh.name, primitive | {"targets": attributes[1:]}, mesh.colour)
+    shown["extras"] = {"targetNames": [f"frame_{t:04}" for t in range(1, frames)]}
     number = frames * (frames - 1)
-    document.moved(node, "weights", keys, document.accessor(document.view(4 * number, weights), 0, FLOAT, number, "SCALAR"))
+    weighed = document.accessor(document.view(4 * number, weights), 0, FLOAT, number, "SCALAR")
+    document.moved(document.roots[-1], "weights", keys, weighed)
 
 
 def _body(document: _Document, name: str, body: BodyRecord, motion: MotionRecord, keys: int | None) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.io.records import GarmentRecord
 
-__all__ = ["worn_together"]
+__all__ = ["garment_names", "worn_together"]
 
 
 def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> GarmentRecord:
@@ -27,10 +27,8 @@ def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> Ga
     for first, garment in zip(count, garments, strict=False):
         for group, vertices in garment.groups.items():
             groups.setdefault(group, []).append(first + vertices)
-    for first, stop, name in zip(count, count[1:], names, strict=False):
-        own = Path(name).stem.removeprefix("ncs:")
-        free = (f"{own} {k}" if k > 1 else own for k in itertools.count(1))
-        groups[next(name for name in free if name not in groups)] = [np.arange(first, stop)]
+    own = zip(garment_names(names, groups), itertools.pairwise(count), strict=True)
+    groups |= {name: [np.arange(*ends)] for name, ends in own}
     uv, weights = ([getattr(g, what) for g in garments] for what in ("uv", "weights"))
     skinned = all(w is not None for w in weights)
     notes = [note for g in garments for note in g.notes]
@@ -54,3 +52,12 @@ def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> Ga
         tuple(notes),
         tuple(int(first) for first in count[1:-1]),
     )
+
+
+def garment_names(files: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """Return what garments are called: as their files, but unlike each other and those taken; a second "shirt" is "shirt 2"."""
+    found: list[str] = []
+    for name in (Path(file.removeprefix("ncs:")).stem for file in files):
+        free = (f"{name} {k}" if k > 1 else name for k in itertools.count(1))
+        found.append(next(each for each in free if each not in (*taken, *found)))
+    return found

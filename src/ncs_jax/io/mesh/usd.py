@@ -17,6 +17,7 @@ from ncs_jax.errors import InputError
 from ncs_jax.io.mesh import usd_arrays
 from ncs_jax.io.mesh.axes import TURNS, upright
 from ncs_jax.io.mesh.normals import vertex_normals
+from ncs_jax.io.mesh.objects import MovingObject
 from ncs_jax.io.mesh.part import NamedMesh, chosen_meshes, one_object
 from ncs_jax.io.mesh.polygons import triangle_corners
 from ncs_jax.io.mesh.raw import RawGarment
@@ -126,17 +127,14 @@ def check_installed(file: Path) -> None:
 # --- out --------------------------------------------------------------------------------------------------------------------
 
 
-def write_usd(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray, uv: np.ndarray | None = None
-) -> None:
-    """Write a moving mesh, /garment, in metres and Y up; the file appears whole or not at all.
+def write_usd(path: str | Path, objects: Sequence[MovingObject], fps: float) -> None:
+    """Write a moving mesh, /garment, or several, /garment/NAME, in metres and Y up; the file appears whole or not at all.
 
     `points`, `normals` and `extent` have a time sample a frame, at 0, 1, 2 ..., with fps time codes a second; the default value
     of `points` is the rest shape. .usda is text, the others are binary; .usdz is that in a package, as phones show it.
 
     Args:
-        path: where to. vertices: (T, V, 3) m, float32, Y up. faces: (F, 3) int32. fps: frames per second. rest: (V, 3) m.
-        uv: (F, 3, 2) texture coordinates of corners, which become the primvar `st`.
+        path: where to. objects: at least one, float32, Y up; texture coordinates become the primvar `st`. fps: of frames.
     """
     file = Path(path)
     check_installed(file)
@@ -146,7 +144,7 @@ def write_usd(
 
         inner = Path(folder) / f"{file.stem}{'.usdc' if suffix == '.usdz' else suffix}"
         stage = Usd.Stage.CreateNew(str(inner))
-        _fill(stage, vertices, faces, fps, rest, uv)
+        _fill(stage, objects, fps)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
@@ -171,28 +169,41 @@ def _quietly() -> Iterator[None]:
         delegate.TakeUncoalescedDiagnostics()
 
 
-def _fill(stage, vertices: np.ndarray, faces: np.ndarray, fps: float, rest: np.ndarray, uv: np.ndarray | None) -> None:
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+def _fill(stage, objects: Sequence[MovingObject], fps: float) -> None:
+    from pxr import Tf, UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(vertices) - 1)
-    mesh = UsdGeom.Mesh.Define(stage, "/garment")
-    stage.SetDefaultPrim(mesh.GetPrim())
+    stage.SetEndTimeCode(len(objects[0].vertices) - 1)
+    several = len(objects) > 1
+    if several:
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/garment").GetPrim())
+    for each in objects:
+        name = f"/garment/{Tf.MakeValidIdentifier(each.name)}" if several else "/garment"
+        mesh = UsdGeom.Mesh.Define(stage, name)
+        if not several:
+            stage.SetDefaultPrim(mesh.GetPrim())
+        _fill_mesh(mesh, each)
+
+
+def _fill_mesh(mesh, given: MovingObject) -> None:
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+    vertices, faces, uv = given.vertices, given.faces, given.uv
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(0.32, 0.47, 0.65)])
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*given.colour)])
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     if uv is not None:
         primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
         primvar.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv.reshape(-1, 2), np.float32)))
     points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
-    for when, x in [(Usd.TimeCode.Default(), rest), *((Usd.TimeCode(t), x) for t, x in enumerate(vertices))]:
+    for when, x in [(Usd.TimeCode.Default(), given.rest), *((Usd.TimeCode(t), x) for t, x in enumerate(vertices))]:
         x = np.ascontiguousarray(x, np.float32)
         points.Set(Vt.Vec3fArray.FromNumpy(x), when)
         normals.Set(Vt.Vec3fArray.FromNumpy(vertex_normals(x, faces)), when)
