@@ -235,6 +235,32 @@ def test_self_contact_sees_layers_by_itself(worn):
     assert model.terms.self_contact and not model.terms.layers and len(model.garment.uppers) == 1  # who is over whom is known
 
 
+def test_garments_of_one_file(folder, worn):
+    """As an outfit is exported: a mesh of its own for each; the model is that of two files."""
+    lines, count = [], 1
+    for name in ("inner", "outer"):
+        arrays = np.load(folder / f"{name}.npz")
+        lines += [f"o {name}", *("v {:.9g} {:.9g} {:.9g}".format(*v) for v in arrays["vertices"])]
+        lines += ["f {} {} {}".format(*(f + count)) for f in arrays["faces"]]
+        count += len(arrays["vertices"])
+    (folder / "outfit.obj").write_text("\n".join(lines))
+    text = LAYERED.replace('"inner.npz"', '"outfit.obj"\nmesh = "inner"').replace("outer.npz", "outfit.obj#outer")
+    text = text.replace('pins = "pins"\n', "")
+    (folder / "outfit.toml").write_text(text)
+    found = assemble(load_scene(folder / "outfit.toml"))
+    np.testing.assert_allclose(found.garment.vertices, worn.garment.vertices, atol=1e-8)
+    np.testing.assert_array_equal(found.garment.faces, worn.garment.faces)
+    assert found.garment.layers == (336,) and "outer" in found.garment.groups
+    for name, said in (
+        ("outfit.obj#coat", r"layers\[0\]: no such mesh in the file.*'coat'.*write outfit\.obj#NAME, of .*outer"),
+        ("outfit.obj", r"layers\[0\]: another garment expected.*FILE#MESH"),
+        ("./outfit.obj", r"layers\[0\]: one object expected.*write outfit\.obj#NAME, of .*outer"),
+    ):
+        (folder / "outfit.toml").write_text(text.replace("outfit.obj#outer", name))
+        with pytest.raises(InputError, match=said):
+            assemble(load_scene(folder / "outfit.toml"))
+
+
 def test_each_is_drawn_in_a_colour_of_its_own(worn, folder):
     (motion,) = worn.motions.values()
     x = np.repeat(worn.garment.vertices[None], len(motion.poses), axis=0)

@@ -162,7 +162,7 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
         if name in ("", "none", spec.file, *spec.layers[:i]):
             raise InputError(
                 "another garment expected", file=scene.source, field=f"garment.layers[{i}]", value=name,
-                mend="name a file of its own for each that is worn over the first",
+                mend="name another file for each, or another mesh of it as FILE#MESH",
             )  # fmt: skip
         scene.there(name, f"garment.layers[{i}]")
     if scene.moves_by_itself:
@@ -187,7 +187,7 @@ def _read(scene: Scene, betas: np.ndarray, below: Sequence[Below], dtype) -> Sce
 def read_worn(scene: Scene, body: io.BodyRecord | None = None) -> io.GarmentRecord:
     """Return the garment of a scene, or all of those worn together as one, facing outward; with a body, on it."""
     names = scene.garment.file, *scene.garment.layers
-    worn = [_read_garment(scene, name, body) for name in names]
+    worn = [_read_garment(scene, place, body) for place in range(len(names))]
     return worn[0] if len(worn) == 1 else io.worn_together(names, [_outward(garment) for garment in worn])
 
 
@@ -200,14 +200,26 @@ def _outward(garment: io.GarmentRecord) -> io.GarmentRecord:
     return replace(garment, faces=np.ascontiguousarray(garment.faces[:, ::-1]), uv=uv, notes=(*garment.notes, note))
 
 
-def _read_garment(scene: Scene, name: str, body: io.BodyRecord | None) -> io.GarmentRecord:
-    """Return the garment of a file, on the body and with the weights of its joints, if it has any."""
+def _read_garment(scene: Scene, place: int, body: io.BodyRecord | None) -> io.GarmentRecord:
+    """Return one of the garments worn together, the first of them 0, on the body and with the weights of its joints, if any."""
     spec = scene.garment
-    garment = io.read_garment(scene.path(name), scale=spec.scale, up=spec.up, weld=spec.weld, mesh=spec.meshes)
+    file, mesh, field = scene.path(spec.file), spec.meshes, "garment.mesh"
+    if place:
+        file, mesh, field = scene.path(spec.layers[place - 1]), (), f"garment.layers[{place - 1}]"
+        if "#" in file.name and not file.exists():
+            whole, _, own = str(file).rpartition("#")
+            file, mesh = Path(whole), (own,)
+    try:
+        garment = io.read_garment(file, scale=spec.scale, up=spec.up, weld=spec.weld, mesh=mesh)
+    except InputError as error:
+        if not place or error.field != "garment.mesh":
+            raise
+        mend = (error.mend or "").replace("name ", f"write {file.name}#NAME, of ", 1)
+        raise InputError(error.expected, file=file, field=field, value=error.value, mend=mend) from None
     if body is None:
         return garment
     garment = with_body_weights(garment, body)
-    _check_garment(scene, scene.path(name), garment, body)
+    _check_garment(scene, file, garment, body)
     return garment
 
 

@@ -92,7 +92,7 @@ class GarmentSpec:
     learn_weights: bool = _f(False, "train the skinning weights too")
     over: tuple[str, ...] = _f((), "run folders of trained garments worn below this one; they collide as part of the body")
     layers: tuple[str, ...] = _f(
-        (), "garment meshes worn over `file`, outwards: one model with it, in which each feels the others"
+        (), "garments worn over `file`, outwards, FILE or FILE#MESH: one model with it, in which each feels the others"
     )
 
     @property
@@ -265,7 +265,7 @@ class Scene:
         """
         path = self.path(name)
         if name.startswith("ncs:") or path.exists() or ("#" in path.name and Path(str(path).rpartition("#")[0]).exists()):
-            return path  # the file, or an animation in it
+            return path  # the file, or an animation or a mesh in it
         seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent.absolute()}"
         raise InputError("no such file or folder", file=self.source, field=field, value=name, mend=f"check the path{seen}")
 

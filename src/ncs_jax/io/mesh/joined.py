@@ -55,9 +55,13 @@ def worn_together(names: Sequence[str], garments: Sequence[GarmentRecord]) -> Ga
 
 
 def garment_names(files: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return what garments are called: as their files, but unlike each other and those taken; a second "shirt" is "shirt 2"."""
+    """Return what garments are called: as their files, or as the mesh in FILE#MESH.
+
+    They are unlike each other and those taken: a second "shirt" is "shirt 2".
+    """
     found: list[str] = []
-    for name in (Path(file.removeprefix("ncs:")).stem for file in files):
+    for file in files:
+        name = Path(file).name.rpartition("#")[2] if "#" in Path(file).name else Path(file.removeprefix("ncs:")).stem
         free = (f"{name} {k}" if k > 1 else name for k in itertools.count(1))
         found.append(next(each for each in free if each not in (*taken, *found)))
     return found
