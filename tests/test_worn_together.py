@@ -10,7 +10,8 @@ import pytest
 
 from ncs_jax import InputError, assemble, load_run, load_scene, measure, simulate, train
 from ncs_jax.cli import main
-from ncs_jax.energies.contact.layers import Upper, layer_blocks, layers
+from ncs_jax.energies.contact.layers import Upper, layer_blocks, layers, rim_ways
+from ncs_jax.energies.contact.outside import put_outside
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.io import GarmentRecord, read_animation, worn_together
 from ncs_jax.runs.outside import outside_body
@@ -69,6 +70,17 @@ def test_cloth_beyond_a_rim_touches_nothing():
     beyond = np.asarray(x)[uppers[0].first :, 0] > 0.2
     assert beyond.any() and not beyond.all()
     assert not slope[beyond].any() and np.all(slope[~beyond, 2])  # also where the nearest vertex is on the rim
+
+
+def test_cloth_at_a_rim_is_put_outside_and_beyond_it_is_left():
+    """As contact touches it: the sheet below is whole where the upper one is over its last row."""
+    x, (upper,) = two_sheets(-0.003, (0.09, 0.0))
+    lower, own = x[: upper.first], x[upper.first :]
+    found = put_outside(own, lower, upper.below, jnp.ones(len(lower)), 0.003, rim_ways(lower, upper.below))
+    beyond = np.asarray(own)[:, 0] > 0.2
+    np.testing.assert_array_equal(found[beyond], own[beyond])
+    np.testing.assert_allclose(found[~beyond], np.asarray(own)[~beyond] + [0, 0, 0.006], atol=1e-9)
+    assert np.any(np.asarray(own)[~beyond, 0] > 0.19)
 
 
 def test_blocks_are_no_less_than_the_second_derivative(rng):

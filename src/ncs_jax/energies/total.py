@@ -9,12 +9,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.bending import bending
-from ncs_jax.energies.contact.between import with_between
+from ncs_jax.energies.contact.between import touched
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import nearest_distance, plane_distance
 from ncs_jax.energies.contact.friction import friction
 from ncs_jax.energies.contact.layers import layers
-from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.pairs import nearby_pairs
 from ncs_jax.energies.contact.points import with_points
 from ncs_jax.energies.contact.self_contact import self_contact
@@ -47,8 +46,7 @@ def distances(
         return nearest_distance(x, body, surface, exact=terms.exact)
     if terms.collision == "smooth":
         return blended_contact(x, nearby_quadrics(x, body, surface), surface, 0.0).distance
-    index, _ = nearest_vertex(x[: surface.verts], body, surface, exact=terms.exact)
-    index = with_between(x, body, index, surface)
+    index = touched(x, body, surface, exact=terms.exact)
     return plane_distance(x, body, vertex_normals(body, surface) if normals is None else normals, index)
 
 

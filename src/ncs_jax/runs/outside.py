@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.contact.layers import rim_ways
 from ncs_jax.energies.contact.outside import put_outside
 from ncs_jax.errors import required
 from ncs_jax.geometry.enclosure import beside
@@ -40,8 +41,9 @@ def outside(
     surface, margin = required(model.surface, "model.surface"), MARGIN * model.material.thickness
     x = put_outside(x, pose_body(model, matrices), surface, skin, margin)
     for upper in model.garment.uppers:
-        lower, own, within = x[: upper.first], x[upper.first : upper.stop], (~upper.below.border).astype(x.dtype)
-        x = x.at[upper.first : upper.stop].set(put_outside(own, lower, upper.below, within, margin))
+        lower, own, below = x[: upper.first], x[upper.first : upper.stop], upper.below
+        found = put_outside(own, lower, below, jnp.ones(upper.first, x.dtype), margin, rim_ways(lower, below))
+        x = x.at[upper.first : upper.stop].set(found)
     return x
 
 

@@ -7,11 +7,20 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ncs_jax.energies.contact.halfway import looked_up
+from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.errors import required
 from ncs_jax.geometry.soa_vectors import dot, minus
 
-__all__ = ["with_between"]
+__all__ = ["touched", "with_between"]
+
+
+def touched(
+    x: Float[Array, "all 3 *poses"], body: Float[Array, "body 3 *poses"], surface: Surface, *, exact: bool = True
+) -> Int[Array, "all *poses"]:
+    """Return the body's vertex that each vertex touches, the nearest, and each point between them, `with_between`."""
+    index, _ = nearest_vertex(x[: surface.verts], body, surface, exact=exact)
+    return with_between(x, body, index, surface)
 
 
 def with_between(

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ncs_jax.energies.contact.between import with_between
+from ncs_jax.energies.contact.between import touched
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import nearest_distance, plane_distance, triangle_distance
-from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
+from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.points import on_vertices, with_points
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.geometry.closest_point import closest_weights
 
-__all__ = ["Upper", "layer_blocks", "layer_distances", "layers"]
+__all__ = ["Upper", "layer_blocks", "layer_distances", "layers", "rim_ways"]
 
 
 @jax.tree_util.register_dataclass
@@ -33,16 +33,15 @@ class Upper:
 def _by_planes(x: Float[Array, "verts 3 *poses"], upper: Upper) -> Float[Array, "points *poses"]:
     """Return distances from the plane of the nearest vertex below, m; cloth that hangs beyond a rim touches nothing."""
     lower, own, surface = x[: upper.first], x[upper.first : upper.stop], upper.below
-    index, _ = nearest_vertex(own, lower, surface)
     if surface.points is not None:
         own = lax.optimization_barrier(with_points(own, surface.points))
-        index = with_between(own, lower, index, surface)
+    index = touched(own, lower, surface)
     distance = plane_distance(own, lower, vertex_normals(lower, surface), index)
-    beyond = lax.stop_gradient(plane_distance(own, lower, _outwards(lower, surface), index)) > 0
+    beyond = lax.stop_gradient(plane_distance(own, lower, rim_ways(lower, surface), index)) > 0
     return jnp.where(surface.border[index] & beyond, jnp.inf, distance)
 
 
-def _outwards(lower: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
+def rim_ways(lower: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
     """Return the ways out of the surface at its rim: from the middles of the triangles around each vertex to it."""
     middles = jnp.mean(lower[surface.faces], axis=1)
     around = [jnp.take(middles, at, axis=0, mode="fill", fill_value=0) for at in surface.rings.T]

@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ncs_jax.energies.contact.between import with_between
+from ncs_jax.energies.contact.between import touched
 from ncs_jax.energies.contact.distance import gathered
-from ncs_jax.energies.contact.nearest import nearest_vertex
 from ncs_jax.energies.contact.points import on_vertices, with_points
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.geometry.soa_vectors import dot, minus
@@ -25,6 +24,7 @@ def put_outside(
     surface: Surface,
     skin: Float[Array, "body"],
     margin: float | Float[Array, ""],
+    rims: Float[Array, "body 3 *poses"] | None = None,
 ) -> Float[Array, "verts 3 *poses"]:
     """Return cloth whose vertices, and the points between them, lie outside of the skin by a margin, m.
 
@@ -36,7 +36,8 @@ def put_outside(
     skin. So cloth that lies deeper stays where it is.
 
     Args:
-        x, body: in one pose or several. surface: of both. skin: 1 for vertices of the body that push, 0 for others.
+        x, body: in one pose or several. surface: of both. skin: 1 for vertices of the body that push, 0 for others. rims: the
+            ways out of its rim, beyond which nothing pushes.
 
     It has no memory and no velocity: each frame is mended by itself. Cf. Mueller et al. 2007, Position Based Dynamics.
     """
@@ -44,9 +45,11 @@ def put_outside(
 
     def once(_, x):
         p = with_points(x, surface.points)
-        index = with_between(p, body, nearest_vertex(x, body, surface)[0], surface)
+        index = touched(p, body, surface)
         normal, gap = gathered(normals, index), minus([p[:, i] for i in range(3)], gathered(body, index))
         share = skin[index] * jnp.clip((FAR - jnp.sqrt(dot(gap, gap))) / (FAR - NEAR), 0, 1)
+        if rims is not None:
+            share = jnp.where(surface.border[index] & (dot(gathered(rims, index), gap) > 0), 0, share)
         short = share * jnp.maximum(margin - dot(normal, gap), 0)
         moved = on_vertices(jnp.stack([short * n for n in normal], axis=1), surface.points)
         carried = on_vertices((short > 0)[:, None].astype(x.dtype), surface.points)
