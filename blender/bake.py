@@ -1,4 +1,4 @@
-"""The trained garment over the scene's frames, as a Mesh Cache modifier."""
+"""The trained garment over the scene's frames, as a Mesh Cache modifier or as shape keys."""
 
 import contextlib
 import struct
@@ -8,7 +8,18 @@ import bpy
 import numpy as np
 
 from . import commands
-from .export import Names, at_rest, frames_kept, mesh_of, posed_frames, read_skeleton, shape_modifiers, write_motion
+from .export import (
+    KEY,
+    Names,
+    at_rest,
+    frames_kept,
+    mesh_of,
+    own_keys,
+    posed_frames,
+    read_skeleton,
+    shape_modifiers,
+    write_motion,
+)
 from .pose import Wrong, from_metres
 from .process import warnings
 from .tasks import Command
@@ -31,14 +42,16 @@ def write_pc2(file: Path, vertices: np.ndarray) -> None:
     file.write_bytes(head + np.ascontiguousarray(vertices, "<f4").tobytes())
 
 
-def bake(names: Names, command: list[str], trained: Path):
-    """Animate the scene's frames, and give the garment its cache; yield what is done in between.
+def bake(names: Names, command: list[str], trained: Path, keys: bool = False):
+    """Animate the scene's frames, and give the garment its cache, or keys; yield what is done in between.
 
-    The cache holds the garment in its own space in every frame, so its object may stand, be turned and be scaled as it likes.
+    Both hold the garment in its own space in every frame, so its object may stand, be turned and be scaled as it likes.
     """
     scene, skeleton = names.scene_now(), read_skeleton(trained / "skeleton.json")
     first, last = scene.frame_start, scene.frame_end
     count = garment_vertices(names)
+    if keys:
+        check_keys(names.of("garment"), count)
     poses, places, alphas, told = [], [], [], ""
     with frames_kept(names):
         for frame, pose in posed_frames(names, skeleton, first, last):
@@ -63,9 +76,15 @@ def bake(names: Names, command: list[str], trained: Path):
         raise Wrong(f"the garment was trained with {x.shape[1]} vertices and has {count}: train again")
     inner = np.linalg.inv(np.array(places))
     local = np.einsum("tab,tvb->tva", inner[:, :3, :3], from_metres(x, skeleton.unit)) + inner[:, None, :3, 3]
-    file = trained / f"baked_{first}_{last}.pc2"
-    write_pc2(file, local)
-    give_cache(names.of("garment"), file, first)
+    garment = names.of("garment")
+    if keys:
+        give_keys(garment, local, first)
+    else:
+        file = trained / f"baked_{first}_{last}.pc2"
+        write_pc2(file, local)
+        drop_keys(garment)
+        give_cache(garment, file, first)
+    worn_already(garment)
     return "; ".join([f"baked frames {first} to {last}", *warnings(told)])
 
 
@@ -86,6 +105,54 @@ def give_cache(garment, file: Path, first: int) -> None:
     cache.time_mode, cache.play_mode, cache.frame_start, cache.frame_scale = "FRAME", "SCENE", first, 1.0
     cache.forward_axis, cache.up_axis = "POS_Y", "POS_Z"
     cache.show_viewport = cache.show_render = True
+
+
+def worn_already(garment) -> None:
+    """Turn off what would move the cloth again: it is on the character."""
     for modifier in garment.modifiers:
-        if modifier.type in ("ARMATURE", "CLOTH"):  # the cloth is on the character already
+        if modifier.type in ("ARMATURE", "CLOTH"):
             modifier.show_viewport = modifier.show_render = False
+
+
+def check_keys(garment, count: int) -> None:
+    """Refuse a garment whose mesh can't hold the cloth as shape keys."""
+    there = len(garment.data.vertices)
+    if there != count:
+        raise Wrong(
+            f"{garment.name} has {there} vertices, and {count} after its first modifiers: apply these, or bake a Mesh Cache"
+        )
+    block = garment.data.shape_keys
+    if block and len(block.key_blocks) - len(own_keys(garment)) > 1:
+        raise Wrong(f"{garment.name} has shape keys of its own: apply or remove them, or bake a Mesh Cache")
+
+
+def give_keys(garment, local: np.ndarray, first: int) -> None:
+    """Give the garment a shape key for each frame, which is 1 in that frame and 0 in the others, linear in between."""
+    if (cache := garment.modifiers.get(CACHE)) is not None:
+        garment.modifiers.remove(cache)
+    drop_keys(garment)
+    if garment.data.shape_keys is None:
+        garment.shape_key_add(name="Basis", from_mix=False)
+    garment.data.shape_keys.use_relative = True
+    edit = bpy.context.preferences.edit
+    usual, edit.keyframe_new_interpolation_type = edit.keyframe_new_interpolation_type, "LINEAR"
+    try:
+        for k, x in enumerate(local):
+            key = garment.shape_key_add(name=f"{KEY}{first + k:04}", from_mix=False)
+            key.data.foreach_set("co", x.astype(np.float32).ravel())
+            for frame, value in ((-1, 0.0), (1, 0.0), (0, 1.0)):
+                if 0 <= k + frame < len(local):
+                    key.value = value
+                    key.keyframe_insert("value", frame=first + k + frame)
+    finally:
+        edit.keyframe_new_interpolation_type = usual
+    garment.data.update()
+
+
+def drop_keys(garment) -> None:
+    """Remove the shape keys of an earlier bake, with what moves them."""
+    if not own_keys(garment):
+        return
+    garment.data.shape_keys.animation_data_clear()
+    for key in own_keys(garment):
+        garment.shape_key_remove(key)

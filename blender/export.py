@@ -17,6 +17,7 @@ from .scene_file import OWN, file_names, write_scene
 
 # What makes a garment's mesh when it stands before all others; the rest comes after the cloth has moved.
 SHAPES = {"ARRAY", "BEVEL", "BOOLEAN", "DECIMATE", "MIRROR", "REMESH", "SCREW", "SKIN", "TRIANGULATE", "WELD"}
+KEY = "Neural Cloth "  # how the names of baked shape keys begin
 HELD = 0.5  # weight in the group of pins from which a vertex is held
 
 
@@ -78,12 +79,18 @@ def chosen(context) -> Names:
 
 @contextlib.contextmanager
 def at_rest(names: Names, shown: dict):
-    """Hold the armature in its rest pose, and of objects only the first modifiers: `shown` says how many, by kind."""
+    """Hold the armature in its rest pose, and of objects only the first modifiers: `shown` says how many, by kind.
+
+    Baked shape keys of the garment are left out.
+    """
     armature = names.of("armature").data
+    keys = [key for key in own_keys(names.of("garment")) if not key.mute]
     off = [m for kind, count in shown.items() for m in names.of(kind).modifiers[count:] if m.show_viewport]
     pose, armature.pose_position = armature.pose_position, "REST"
     for modifier in off:
         modifier.show_viewport = False
+    for key in keys:
+        key.mute = True
     try:
         names.layer_now().update()
         yield
@@ -91,7 +98,15 @@ def at_rest(names: Names, shown: dict):
         armature.pose_position = pose
         for modifier in off:
             modifier.show_viewport = True
+        for key in keys:
+            key.mute = False
         names.layer_now().update()
+
+
+def own_keys(garment) -> list:
+    """Return the garment's shape keys that were baked."""
+    block = garment.data.shape_keys
+    return [key for key in block.key_blocks[1:] if key.name.startswith(KEY)] if block else []
 
 
 def shape_modifiers(garment) -> int:

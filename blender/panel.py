@@ -187,6 +187,7 @@ class NCS_PT_panel(bpy.types.Panel):
         row = layout.row(align=True)
         row.enabled = not tasks.busy()
         row.operator("ncs.bake")
+        row.prop(own, "bake_as", text="")
         row.operator("ncs.live", depress=live.current is not None)
         self.draw_state(layout)
         layout.prop(own, "trained")

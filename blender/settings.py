@@ -4,7 +4,15 @@ import tempfile
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from .export import Names
 from .pose import Wrong
@@ -44,6 +52,13 @@ class NCS_Settings(bpy.types.PropertyGroup):
         name="Alpha", description="How much the garment moves: 0 static, 1 as trained, more exaggerates",
         default=1.0, min=0.0, max=10.0, soft_max=2.0, options={"ANIMATABLE"},
         update=lambda self, context: self.id_data.update_tag(),  # or Blender would evaluate the last one
+    )  # fmt: skip
+    bake_as: EnumProperty(
+        name="Bake as", description="How the garment keeps its frames", default="CACHE",
+        items=(
+            ("CACHE", "Mesh Cache", "A modifier that reads a file: any number of frames"),
+            ("KEYS", "Shape Keys", "In the mesh itself, a key a frame: for exporters and other programs"),
+        ),
     )  # fmt: skip
     folder: StringProperty(
         name="Folder", description="Where files are written; empty: beside the .blend", subtype="DIR_PATH", options=RELATIVE

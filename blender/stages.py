@@ -64,7 +64,7 @@ def resumed(context):
 def baked(context):
     """Bake the scene's frames; yield what is done in between."""
     ncs, names, folder = needed_command(context), chosen(context), trained_folder(context)
-    return (yield from bake(names, ncs, folder))
+    return (yield from bake(names, ncs, folder, context.scene.ncs.bake_as == "KEYS"))
 
 
 def installed(context):

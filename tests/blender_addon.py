@@ -238,6 +238,29 @@ def speed(rounds: int = 5) -> float:
     return 1000 * (time.monotonic() - began) / rounds / (LAST + 1 - FIRST)
 
 
+def bake_keys(garment, found: dict, work: Path) -> None:
+    """Bake as shape keys, with all that can go wrong with them, and as a cache again."""
+    own, fresh = bpy.context.scene.ncs, (work / "scene" / "garment.npz").read_bytes()
+    own.bake_as = "KEYS"
+    mirror = garment.modifiers.new("Mirror", "MIRROR")
+    garment.modifiers.move(garment.modifiers.find("Mirror"), 0)
+    found["more"] = refusal(bpy.ops.ncs.bake)
+    garment.modifiers.remove(mirror)
+    garment.shape_key_add(name="Basis")
+    other = garment.shape_key_add(name="Wide")
+    found["keys_of_its_own"] = refusal(bpy.ops.ncs.bake)
+    garment.shape_key_remove(other)
+    for _ in range(2):
+        assert bpy.ops.ncs.bake() == {"FINISHED"}
+    found["keys"], found["blocks"] = played(garment), [k.name for k in garment.data.shape_keys.key_blocks]
+    found["keyed_modifiers"] = [m.type for m in garment.modifiers]
+    assert bpy.ops.ncs.check() == {"FINISHED"}
+    assert (work / "scene" / "garment.npz").read_bytes() == fresh  # at rest, whatever the keys say
+    own.bake_as = "CACHE"
+    assert bpy.ops.ncs.bake() == {"FINISHED"}
+    found["again"], found["blocks_again"] = played(garment), len(garment.data.shape_keys.key_blocks)
+
+
 def main(folder: Path, assets: Path, packed: str, command: str) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     preferences = enabled(packed, command)
@@ -288,6 +311,7 @@ def main(folder: Path, assets: Path, packed: str, command: str) -> None:
     bpy.ops.ncs.bake()
     found["keyed_baked"], found["gone"] = played(garment), "Dress live" not in bpy.data.objects
     found["modifiers"] = [m.type for m in garment.modifiers]
+    bake_keys(garment, found, work)
     found["texts"], found["images"] = [t.name for t in bpy.data.texts], [i.name for i in bpy.data.images]
     own.minutes = 5
     for name in ("check", "train"):

@@ -370,6 +370,11 @@ def test_alpha_has_keys(in_blender):
             truth["keyed_baked"][frame], run.animate(run.motion(motion), alpha, outside=True)[frame], rtol=0, atol=1e-4
         )
     assert np.abs(truth["keyed_baked"] - truth["other"]).max() > 1e-4
+    np.testing.assert_allclose(truth["keys"], truth["keyed_baked"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(truth["again"], truth["keyed_baked"], rtol=0, atol=1e-6)
+    assert truth["blocks"].tolist() == ["Basis", *(f"Neural Cloth {frame:04}" for frame in range(1, 25))]
+    assert truth["blocks_again"] == 1 and "MESH_CACHE" not in truth["keyed_modifiers"]
+    assert "after its first modifiers" in str(truth["more"]) and "shape keys of its own" in str(truth["keys_of_its_own"])
 
 
 @pytest.mark.slow
