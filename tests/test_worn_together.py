@@ -10,7 +10,7 @@ import pytest
 
 from ncs_jax import InputError, assemble, load_run, load_scene, measure, simulate, train
 from ncs_jax.cli import main
-from ncs_jax.energies.contact.layers import Upper, layer_blocks, layers, rim_ways
+from ncs_jax.energies.contact.layers import Upper, layer_blocks, layer_product, layers, rim_ways
 from ncs_jax.energies.contact.outside import put_outside
 from ncs_jax.energies.contact.surface import surface_from
 from ncs_jax.io import GarmentRecord, read_animation, worn_together
@@ -83,6 +83,27 @@ def test_cloth_at_a_rim_is_put_outside_and_beyond_it_is_left():
     assert np.any(np.asarray(own)[~beyond, 0] > 0.19)
 
 
+def test_nothing_jumps_past_a_rim(rng):
+    """By triangles: energy and force over the rim of a wavy sheet, and their agreement, go on; a thickness past it is none."""
+    x, uppers = two_sheets(-0.001, (0.09, 0.0))
+    x = np.array(x)
+    x[:, 2] += 0.002 * np.sin(40 * x[:, 0]) * np.cos(30 * x[:, 1])
+    x, own = jnp.asarray(x), np.s_[uppers[0].first :]
+    energy = jax.jit(lambda x: layers(x, uppers, 0.004, 10.0, planes=False))
+    slope = jax.jit(jax.grad(lambda x: layers(x, uppers, 0.004, 10.0, planes=False)))
+    found = np.asarray(slope(x))
+    size = np.abs(found).sum(axis=0).max()
+    np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-9 * size)
+    np.testing.assert_allclose(np.cross(x, found).sum(axis=0), 0, atol=1e-7 * size)
+    for _ in range(3):
+        way, h = rng.normal(size=x.shape), 1e-8
+        assert (energy(x + h * way) - energy(x - h * way)) / (2 * h) == pytest.approx(np.sum(found * way), rel=1e-4)
+    heights = np.array([float(energy(x.at[own, 0].add(s))) for s in np.linspace(0, 0.0167, 200)])
+    assert np.abs(np.diff(heights)).max() < 0.03 * heights[0] and heights[-1] < 0.7 * heights[0]
+    alone = x.at[own].set(np.array([0.2041, 0.1, -0.001]) + 1e-4 * np.asarray(x)[own])
+    assert float(energy(alone)) == 0
+
+
 def test_blocks_are_no_less_than_the_second_derivative(rng):
     """Along the planes' normals, where the sheet below moves as a whole: its planes do not turn."""
     x, uppers = two_sheets(0.001)
@@ -94,6 +115,20 @@ def test_blocks_are_no_less_than_the_second_derivative(rng):
         flat = np.where(np.arange(len(x)) < uppers[0].first, way[0], way)
         found.append((flat @ curvature @ flat) / np.einsum("v,v,v", flat, blocks[:, 2, 2], flat))
     assert 0.05 < max(found) <= 1 + 1e-9
+
+
+def test_product_is_that_of_the_second_derivative(rng):
+    """Of fields along the normal, where the sheet below moves as a whole: its planes do not turn."""
+    x, uppers = two_sheets(0.001)
+    product = layer_product(x, uppers, 0.004, 10.0)
+    slope = jax.jit(jax.grad(lambda x: layers(x, uppers, 0.004, 10.0, planes=False)))
+    for _ in range(3):
+        height = rng.normal(size=len(x))
+        height[: uppers[0].first] = height[0]
+        way = jnp.asarray(height[:, None] * [0, 0, 1])
+        small = 1e-7 * way
+        expected = (slope(x + small) - slope(x - small)) / 2e-7
+        np.testing.assert_allclose(product(way)[:, 2], expected[:, 2], atol=1e-4 * float(jnp.abs(expected).max()))
 
 
 def record(count, **more):

@@ -63,7 +63,7 @@ def set_up(
             is not on the body.
     """
     say = report or (lambda words: None)
-    say(f"reading {scene.garment.file} and {scene.body.file}")
+    say(f"reading {', '.join((scene.garment.file, *scene.garment.layers))} and {scene.body.file}")
     betas = _betas(scene) if prepared is None else prepared.betas
     files = _read(scene, betas, below, dtype)
     motions: dict[str, io.MotionRecord] = {}

@@ -17,6 +17,7 @@ from ncs_jax.export.check import Check, check_file, load_step
 from ncs_jax.export.onnx_lowering import onnx_model
 from ncs_jax.export.step import RESULTS, Step, flat_step, rounded
 from ncs_jax.geometry.skinning import blend_from
+from ncs_jax.io.mesh.joined import garment_names
 from ncs_jax.network.methods.method import Method, for_inference
 from ncs_jax.runs.run import Run
 from ncs_jax.scene.model import Model
@@ -221,8 +222,9 @@ def _motion(number: int, name: str, motion: io.MotionRecord, run: Run, data: dic
 
 
 def _title(run: Run) -> str:
-    """Return the garment's name, of its file."""
-    return Path(run.assembly.scene.garment.file).stem.removeprefix("ncs:").replace("_", " ").capitalize()
+    """Return the names of the garments, of their files."""
+    spec = run.assembly.scene.garment
+    return ", ".join(garment_names((spec.file, *spec.layers))).replace("_", " ").capitalize()
 
 
 def _facts(run: Run, runtime: BrowserRuntime, check: Check | None) -> dict[str, str]:

@@ -9,7 +9,7 @@ A direction is made at the start of a frame, `begin(problem, x, point) -> memory
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ncs_jax.energies.contact import self_contact
+from ncs_jax.energies.contact.layers import layer_blocks, layer_product
 from ncs_jax.simulation.solver.cholesky import Factor, factorise, solve
 from ncs_jax.simulation.solver.conjugate_gradients import conjugate_gradients
 from ncs_jax.simulation.solver.problem import dot, stiffness_blocks
@@ -41,17 +42,26 @@ class Direction:
 def _newton(problem, x, point, memory):
     """-H^-1 g, H with element Hessians made positive semi-definite (Teran et al. 2005).
 
-    Cloth that touches itself couples vertices that no element does: then the rest of the matrix preconditions the whole.
+    Cloth that touches cloth couples vertices that no element does: then the rest of the matrix preconditions the whole.
     """
-    diagonal, off = stiffness_blocks(problem, x, point._replace(repulsion=None))
-    if point.repulsion is None:
-        return -solve(problem.order, factorise(problem.order, diagonal, off), point.gradient), memory
-    stiff = problem.model.material.self_contact
-    factor = factorise(problem.order, diagonal + self_contact.blocks(point.repulsion, x, stiff), off)
+    garment, material, terms = problem.model.garment, problem.model.material, problem.model.terms
+    alone = replace(problem, model=replace(problem.model, terms=replace(terms, layers=None)))
+    diagonal, off = stiffness_blocks(alone, x, point._replace(repulsion=None))
+    near, products = diagonal, []
+    if point.repulsion is not None:
+        near = near + self_contact.blocks(point.repulsion, x, material.self_contact)
+        products.append(lambda p: self_contact.product(point.repulsion, p, material.self_contact))
+    if terms.layers:
+        given = x, garment.uppers, material.thickness, material.collision
+        near = near + layer_blocks(*given) / 2
+        products.append(layer_product(*given))
+    factor = factorise(problem.order, near, off)
+    if not products:
+        return -solve(problem.order, factor, point.gradient), memory
     free = jnp.ones((len(x), 1), x.dtype) if problem.free is None else problem.free[:, None].astype(x.dtype)
 
     def matrix(p):
-        return multiply(problem.couplings, diagonal, off, p) + free * self_contact.product(point.repulsion, p, stiff)
+        return multiply(problem.couplings, diagonal, off, p) + free * sum(product(p) for product in products)
 
     return -conjugate_gradients(matrix, lambda r: solve(problem.order, factor, r), point.gradient, FORCING, TURNS), memory
 
