@@ -145,7 +145,9 @@ def curve(options, spec: Scene) -> dict:
     start, exact = stepper(simulator, many).init(), np.zeros(0)
     for name, settings in wanted.items():
         of = replace(settings, iterations=many.iterations)  # the limit is given frame by frame
-        program = programs.setdefault(of, compiled(simulator, of, matrices[0])) if of not in programs else programs[of]
+        if of not in programs:
+            programs[of] = compiled(simulator, of, matrices[0])
+        program = programs[of]
         if not rows:
             start = program.frame(start, matrices[0], settings.first)
         rolled = stream(program, start, matrices[1:], [settings.iterations] * steps)
@@ -157,7 +159,8 @@ def curve(options, spec: Scene) -> dict:
     told = {"changed": changed, "vertices": len(model.garment.mesh.rest), "start": f"{float(start.solution.residual):.3g} g"}
     if not options.quick:
         told |= vbd_rows(rows, options, simulator, matrices, exact)
-    draw(rows, f"{spec.source or options.scene}, {told['vertices']} vertices, {steps} frames", Path(options.picture))
+    motion = spec.motion.files[0].rpartition("/")[2]
+    draw(rows, f"{Path(options.scene).stem}, {motion}, {told['vertices']} vertices, {steps} frames", Path(options.picture))
     return {"rows": rows, **told}
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,15 +31,13 @@ def test_a_residual_is_what_the_solver_reports(tmp_path):
     """Of its own trajectory, with contact, friction and pins; and more of another one."""
     assembly = sleeve(tmp_path, collision={"distance": "triangle", "friction": 0.3})
     simulation = simulator_from(assembly.model)
-    track = replace(assembly.track, matrices=assembly.track.matrices[:4])
-    for exact in (True, False):
-        settings = Settings(tolerance=0.01, exact_pins=exact, iterations=3)
-        x, solution = simulate(simulation, track, settings)
-        x = np.asarray(track.relative(x))
-        left = residuals(simulation, track.matrices, x, exact_pins=exact)
-        np.testing.assert_allclose(left, solution.residual[1:], rtol=1e-5)
+    track = jax.tree.map(lambda a: a[:4], assembly.track)
+    x, solution = simulate(simulation, track, Settings(tolerance=0.01, exact_pins=True, iterations=3))
+    x = np.array(track.relative(x))
+    left = residuals(simulation, track.matrices, x, exact_pins=True)
+    np.testing.assert_allclose(left, solution.residual[1:], rtol=1e-5)
     x[2, 0, 1] += 1e-3
-    assert (residuals(simulation, track.matrices, x)[1:] > left[1:] + 1).all()
+    assert (residuals(simulation, track.matrices, x, exact_pins=True)[1:] > left[1:] + 1).all()
 
 
 def test_a_scene_is_made_comparable(tmp_path):
