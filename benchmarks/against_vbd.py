@@ -32,6 +32,7 @@ from ncs_jax import InputError
 from ncs_jax.energies.bending import hinge_weight
 from ncs_jax.errors import required
 from ncs_jax.geometry.skinning import blend, skin
+from ncs_jax.io.tables.npz import write_npz
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.scene.spec import Scene
 
@@ -111,7 +112,7 @@ def roll(python: str, problem: dict[str, np.ndarray]) -> tuple[list[Rolled], str
         raise InputError("NVIDIA Newton is not installed here, so VBD is left out", mend=HOW)
     with tempfile.TemporaryDirectory() as folder:
         given, answer = (Path(folder) / name for name in ("problem.npz", "answer.npz"))
-        np.savez(given, **problem)
+        write_npz(given, **problem)
         command = [python or sys.executable, str(Path(__file__).with_name("vbd.py")), str(given), str(answer)]
         apart = os.environ | {"PYTHONSAFEPATH": "1"}  # modules here are not to be taken for Newton's
         try:

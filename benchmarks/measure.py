@@ -89,7 +89,7 @@ def _copying(size: int, rounds: int) -> float:
 # --- clocks and memory ------------------------------------------------------------------------------------------------
 
 
-def clock(seconds: Sequence[float], compiling: float = 0.0) -> dict[str, float]:
+def clock(seconds: Sequence[float] | np.ndarray, compiling: float = 0.0) -> dict[str, float]:
     """What is told of repeats, in seconds."""
     a = np.asarray(seconds)
     figures = {"min": a.min(), "median": np.median(a), "p99": np.percentile(a, 99), "max": a.max()}

@@ -208,19 +208,20 @@ def draw(rows: dict[str, dict], title: str, file: Path) -> None:
         points = {name.partition(", ")[2]: row for name, row in rows.items() if name.split(", ")[0] == solver and "mm" in row}
         if not points:
             continue
-        both = [[row[key] for row in points.values()] for key in ("seconds", "residual")]
-        middles = [np.array([each["median"] for each in side]) for side in both]
-        bars = [
-            np.maximum([[m - each["p10"] for m, each in pairs], [each["p90"] - m for m, each in pairs]], 0)
-            for pairs in (list(zip(m, side, strict=True)) for m, side in zip(middles, both, strict=True))
-        ]
-        axes.errorbar(*middles, xerr=bars[0], yerr=bars[1], fmt=look, label=label, elinewidth=0.7, capsize=2)
-        for name, x, y in zip(points, *middles, strict=True):
-            axes.annotate(name, (x, y), textcoords="offset points", xytext=(6, 5), fontsize=8)
+        (x, wide), (y, high) = (_bars([row[key] for row in points.values()]) for key in ("seconds", "residual"))
+        axes.errorbar(x, y, xerr=wide, yerr=high, fmt=look, label=label, elinewidth=0.7, capsize=2)
+        for name, place in zip(points, zip(x, y, strict=True), strict=True):
+            axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=8)
     axes.grid(which="both", alpha=0.2)
     axes.legend()
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=150)
+
+
+def _bars(spreads: Sequence[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return medians, and how far 10 and 90 % are from them."""
+    low, middle, high = (np.array([each[key] for each in spreads]) for key in ("p10", "median", "p90"))
+    return middle, np.stack([middle - low, high - middle])
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

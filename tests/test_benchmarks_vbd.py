@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -126,3 +127,17 @@ def test_rows_of_vbd(tmp_path, monkeypatch):
     assert (tmp_path / "new" / "x.png").stat().st_size > 10_000
     text = simulator.show({"rows": rows | {"VBD": {"failed": "why"}}, "changed": "nothing"})
     assert "VBD: why" in text and "1 of 2" in text and len(text.splitlines()) == 8
+
+
+@pytest.mark.slow  # nearly all of it is compiling
+def test_the_picture(tmp_path, plain_jax, monkeypatch, capsys):
+    """One run gives the table and the picture, without VBD where that cannot run."""
+    monkeypatch.setattr(simulator, "TOLERANCES", (0.1, 1.0))
+    monkeypatch.setattr(simulator, "ITERATIONS", (3,))
+    picture, figures = tmp_path / "x.png", tmp_path / "x.json"
+    given = [str(write_scene(tmp_path)), "--frames", "3", "--picture", str(picture), "--json", str(figures)]
+    assert simulator.main([*given, "--motion", str(tmp_path / "swing.npz"), "--vbd-python", str(tmp_path / "none")]) == 0
+    rows = json.loads(figures.read_text())["rows"]
+    assert list(rows) == ["newton, 0.1 g", "newton, 1 g", "quasi_newton, 3 iterations", "VBD"] and picture.exists()
+    assert rows["newton, 0.1 g"]["mm"] == 0 < rows["newton, 1 g"]["mm"] and rows["newton, 1 g"]["residual"]["max"] <= 1
+    assert "did not run" in rows["VBD"]["failed"] and "neo_hookean" in capsys.readouterr().out
