@@ -89,7 +89,7 @@ def _copying(size: int, rounds: int) -> float:
 # --- clocks and memory ------------------------------------------------------------------------------------------------
 
 
-def clock(seconds: Sequence[float], compiling: float = 0.0) -> dict[str, float]:
+def clock(seconds: Sequence[float] | np.ndarray, compiling: float = 0.0) -> dict[str, float]:
     """What is told of repeats, in seconds."""
     a = np.asarray(seconds)
     figures = {"min": a.min(), "median": np.median(a), "p99": np.percentile(a, 99), "max": a.max()}
@@ -245,7 +245,7 @@ def clocks(rows: dict[str, dict], extra: Sequence[str] = ()) -> str:
 def finished(rows: dict[str, dict], bounds: Limits) -> None:
     """Give every row the least time of its work, that of one of `times` where given, and which share it is of the median."""
     for row in rows.values():
-        if "seconds" in row:
+        if "work" in row:
             row["work"] = Work(*row["work"])
             row["least"] = bounds.least(row["work"]) / row.get("times", 1)
             row["share"] = row["least"] / row["seconds"]["median"]
@@ -264,19 +264,23 @@ def run(
 
     Args:
         doc: of the module. measure: from the options to the figures. show: what to print of them. scene: the default one.
-        options: default and meaning of further options by name; those with an empty tuple take several numbers.
+        options: default and meaning of further options by name; those with an empty tuple take several numbers, with a string a
+            string.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", nargs="?", default=scene, help=f"scene file, or ncs:NAME (default: {scene})")
     parser.add_argument("--quick", action="store_true", help="as little of everything as still runs, to see that it does")
     parser.add_argument("--json", metavar="FILE", help="write the figures there too")
     for name, (default, text) in options.items():
+        flag = "--" + name.replace("_", "-")
         if default is False:
-            parser.add_argument(f"--{name}", action="store_true", help=text)
+            parser.add_argument(flag, action="store_true", help=text)
+        elif isinstance(default, str):
+            parser.add_argument(flag, default=default, metavar="TEXT", help=text)
         elif default == ():
-            parser.add_argument(f"--{name}", type=float, nargs="+", default=default, help=text)
+            parser.add_argument(flag, type=float, nargs="+", default=default, help=text)
         else:
-            parser.add_argument(f"--{name}", type=_whole, default=default, metavar="N", help=f"{text} (default: {default})")
+            parser.add_argument(flag, type=_whole, default=default, metavar="N", help=f"{text} (default: {default})")
     chosen = parser.parse_args(arguments)
     name = doc.split("python -m ")[1].split()[0].rpartition(".")[2]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `ncs` does
