@@ -414,6 +414,8 @@ def test_arrays_tell_where_each_garment_begins(tmp_path):
         io.write_animation(tmp_path / name, x, faces, 24, names=("shirt", "coat", "hero"), layers=(3,))
         np.testing.assert_allclose(io.read_animation(tmp_path / name).vertices, x)
     assert np.load(tmp_path / "a.npz")["layers"].tolist() == [3]
+    with pytest.raises(InputError, match=r"b\.pc2: names: names of 2 garments and the body expected"):
+        io.write_animation(tmp_path / "b.pc2", x, faces, 24, layers=(3,))
     with h5py.File(tmp_path / "a.h5") as file:
         assert file["layers"][()].tolist() == [3]
 

@@ -71,6 +71,8 @@ def write_animation(
         raise InputError("at least one frame and one vertex expected", file=file, field="vertices", value=x.shape)
     if not 0 < float(fps) < np.inf:
         raise InputError("a number above 0 expected", file=file, field="fps", value=fps)
+    if len(names) != len(layers) + 2:
+        raise InputError(f"names of {len(layers) + 1} garments and the body expected", file=file, field="names", value=names)
     maps = None if uv is None else floats(file, "uv", np.asarray(uv), (len(triangles), 3, 2), ("face", "corner"))
     at_rest = x[0] if rest is None else floats(file, "rest", np.asarray(rest), (x.shape[1], 3), ("vertex",))
     objects = objects_of(names[:-1], layers, x, at_rest, triangles, maps)
