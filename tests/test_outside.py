@@ -7,16 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ncs_jax.energies.contact.distance import plane_distance
+from ncs_jax.energies.contact.nearest import boxes_around, nearest_of_few, nearest_vertex
 from ncs_jax.energies.contact.outside import put_outside
 from ncs_jax.energies.contact.points import contact_points, with_points
-from ncs_jax.energies.contact.surface import surface_from
+from ncs_jax.energies.contact.surface import surface_from, vertex_normals
+from ncs_jax.geometry.closest_point import triangle_square
 from ncs_jax.metrics.quality import measure
 from ncs_jax.runs.outside import outside_body
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 
 from .scenes import SCENE, swing, write_scene
-from .shapes import ball
+from .shapes import ball, tube
 
 RADIUS, MARGIN = 0.2, 0.004
 BALL, TRIANGLES = ball(4, RADIUS)
@@ -68,6 +71,35 @@ def test_what_is_inside_between_vertices_is_carried_out_by_its_corners():
     assert height.min() > MARGIN - 1.5e-3, height
     alone, _ = put(corner)
     assert np.array_equal(alone[..., 0], corner.astype(np.float32))
+
+
+def test_what_the_plane_of_the_nearest_vertex_calls_inside_stays_where_it_is_outside():
+    """Over the sides of a coarse limb: outside by more than the margin, or by half of it, and below the planes of its edges."""
+    body, triangles = tube(8, 4, 0.06, 0.2)
+    angle = (np.arange(8) + 0.5) * np.pi / 4
+    height = 0.06 * np.cos(np.pi / 8) + np.where(np.arange(8) % 2, MARGIN + 1e-4, MARGIN / 2)
+    cloth = np.stack([height * np.sin(angle), np.full(8, 0.1), height * np.cos(angle)], axis=1)
+    surface = surface_from(cloth, body, triangles)
+    x, skin = (jnp.asarray(a, jnp.float32) for a in (cloth, body))
+    index, _ = nearest_vertex(x, skin, surface)
+    assert plane_distance(x, skin, vertex_normals(skin, surface), index).max() < MARGIN - 2e-3
+    moved = np.linalg.norm(put_outside(x, skin, surface, jnp.ones(len(skin), x.dtype), MARGIN) - x, axis=1)
+    assert not moved[1::2].any()
+    np.testing.assert_allclose(moved[::2], MARGIN / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize("poses", [1, 3])
+def test_few_points_find_their_triangle(rng, poses):
+    """As a search of all of them does, but for what is too far from any to matter."""
+    body = np.stack([BALL * rng.uniform(0.8, 1.2, 3) for _ in range(poses)], axis=2)
+    pose = np.arange(200) % poses
+    x = body[rng.integers(len(BALL), size=200), :, pose] + rng.normal(size=(200, 3)) * 0.01
+    surface = surface_from(BALL[:10], BALL, TRIANGLES)
+    every, at = jnp.asarray(body), jnp.asarray(pose, jnp.int32)
+    found = nearest_of_few(list(jnp.asarray(x.T)), at, every, surface, boxes_around(every, surface))
+    corners = jnp.transpose(every[TRIANGLES][..., at], (1, 2, 0, 3))  # (3 corners, 3, triangles, points)
+    square = triangle_square(jnp.asarray(x.T)[:, None], *corners)
+    np.testing.assert_allclose(square[found, jnp.arange(200)], square.min(axis=0), rtol=1e-9)
 
 
 @pytest.fixture

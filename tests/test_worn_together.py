@@ -187,7 +187,8 @@ def test_the_model_knows_who_is_over_whom(worn):
 def test_which_way_a_garment_faces_does_not_matter(folder, worn, tmp_path):
     """All is found as if it faced outward: skinning weights, skin that is touched, and which of it is beside the garments."""
     for name in ("inner", "outer"):
-        arrays = dict(np.load(folder / f"{name}.npz"))
+        with np.load(folder / f"{name}.npz") as file:
+            arrays = dict(file)
         outward = arrays["faces"][:, ::-1] if name == "inner" else arrays["faces"]
         np.savez(tmp_path / f"{name}.npz", **{**arrays, "faces": outward})
     for name in ("body.npz", "swing.npz"):

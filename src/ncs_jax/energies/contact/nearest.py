@@ -13,12 +13,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.geometry.closest_point import triangle_square
-from ncs_jax.geometry.soa_vectors import dot
+from ncs_jax.geometry.soa_vectors import Vector, dot
 
-__all__ = ["components", "nearest_groups", "nearest_triangle", "nearest_vertex", "smallest"]
+__all__ = [
+    "boxes_around",
+    "components",
+    "nearest_groups",
+    "nearest_of_few",
+    "nearest_triangle",
+    "nearest_vertex",
+    "rows_at",
+    "smallest",
+]
 
 
 NEAR = 32  # groups of the body's triangles that a group of cloth looks at in a pose of its own
+WIDE, FEW = 4, 4  # groups that are one for a point by itself, and how many of these it looks at
 
 
 def _squared_to_points(x, points):
@@ -216,3 +226,42 @@ def nearest_triangle(
         cloth, grouped = (lax.stop_gradient(a) for a in (x[surface.cloth_blocks], triangles[surface.face_blocks]))
         lists = nearest_groups(cloth, grouped, NEAR).T
     return _search(x, triangles, _Groups(surface.face_blocks, lists), surface, _squared_to_triangles, 2, exact)
+
+
+class Boxes(NamedTuple):
+    """Boxes around groups of the body's triangles in every pose, and the names of the triangles."""
+
+    low: Float[Array, "groups 3 poses"]
+    high: Float[Array, "groups 3 poses"]
+    triangles: Int[Array, "groups size"]
+
+
+def boxes_around(body: Float[Array, "body 3 poses"], surface: Surface) -> Boxes:
+    """Return what `nearest_of_few` looks in: each box holds `WIDE` neighbouring groups of the surface."""
+    blocks = surface.face_blocks
+    blocks = jnp.pad(blocks, ((0, -len(blocks) % WIDE), (0, 0)), mode="edge").reshape(-1, WIDE * blocks.shape[1])
+    corners = body[surface.faces[blocks].reshape(len(blocks), -1)]
+    return Boxes(corners.min(axis=1), corners.max(axis=1), blocks)
+
+
+def nearest_of_few(
+    x: Vector, pose: Int[Array, "few"], body: Float[Array, "body 3 poses"], surface: Surface, boxes: Boxes
+) -> Int[Array, "few"]:
+    """Find the nearest body triangle of a few points, three components (few,), each in its pose.
+
+    By exact distance to the triangles of the `FEW` boxes that are nearest: for points that are few and far between this costs
+    less than the groups of a whole garment. That no other box holds a nearer one is not proved.
+    """
+    x = [component[None] for component in x]
+    low, high = boxes.low[:, :, pose], boxes.high[:, :, pose]
+    apart = [jnp.maximum(jnp.maximum(low[:, i] - x[i], x[i] - high[:, i]), 0) for i in range(3)]
+    names = boxes.triangles[smallest(dot(apart, apart), min(FEW, len(low)))]  # (FEW, few, size)
+    names = jnp.moveaxis(names, 2, 1).reshape(-1, len(pose))
+    triangle = [rows_at(body, surface.faces[:, k][names], pose[None]) for k in range(3)]
+    return jnp.take_along_axis(names, jnp.argmin(triangle_square(x, *triangle), axis=0)[None], axis=0)[0]
+
+
+def rows_at(table: Float[Array, "rows 3 poses"], row: Int[Array, "*#some"], pose: Int[Array, "*#some"]) -> Vector:
+    """Return three components of rows of a table in the poses named, each gathered by itself."""
+    at = row * table.shape[2] + pose
+    return [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
