@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
-from ncs_jax.energies.contact.smooth import blended_contact, curvatures, nearby_quadrics
+from ncs_jax.energies.contact.smooth import TOGETHER, blended_contact, curvatures, nearby_quadrics
 from ncs_jax.energies.contact.surface import rebuild_lists, surface_from, vertex_normals
 from ncs_jax.geometry.closest_point import closest_weights
 
@@ -470,11 +470,19 @@ def contact_of_some(x, body, surface, some):
     return blended_contact(x, nearby_quadrics(x, body, surface), surface, THICKNESS, some)
 
 
-def test_smooth_contact_of_some_vertices_is_theirs():
+def test_smooth_contact_of_some_groups_is_theirs():
+    """Of more groups than are looked at in one turn, in any order; all others are far away."""
     x, vertices, faces = near_skin("ball")
-    surface, some = surface_from(x, vertices, faces, smooth=True), np.array([5, 3, 77])
-    for part, all_ in zip(contact_of_some(x, vertices, surface, some), contact(x, x, vertices, surface)[0], strict=True):
-        np.testing.assert_allclose(part, np.asarray(all_)[some], rtol=1e-9, atol=1e-15)
+    surface = surface_from(x, vertices, faces, smooth=True)
+    count = len(surface.cloth_blocks)
+    some = np.random.default_rng(1).permutation(count)[: TOGETHER + 3]
+    assert len(some) < count
+    rows = np.unique(surface.cloth_blocks[some])
+    others = np.setdiff1d(np.arange(len(x)), rows)
+    found = contact_of_some(x, vertices, surface, np.concatenate([some, [count, count]]))
+    for part, every in zip(found, contact(x, x, vertices, surface)[0], strict=True):
+        np.testing.assert_allclose(part[rows], np.asarray(every)[rows], rtol=1e-9, atol=1e-15)
+    assert np.isinf(found.distance[others]).all() and not any(np.asarray(part)[others].any() for part in found[:3])
 
 
 def test_curvatures_of_a_ball_and_of_a_tube_and_of_a_floor():

@@ -209,18 +209,19 @@ def test_the_blocks_are_the_hessian_on_planes():
 
 
 def test_some_of_smooth_contact_is_part_of_all():
-    """With what a patch takes as far away: all but its own vertices and the points that they carry."""
+    """With what a patch takes as far away: all but the groups of its own vertices and of the points that they carry."""
     x, _, body, surface = on_a_ball("smooth")
     terms, numbers, points = replace(NOTHING, collision="smooth"), material(), surface.points
     own = np.array([7, 8, 13, 14])
     carried = np.flatnonzero((np.isin(points.corners, own) & (np.asarray(points.weights) > 0)).any(axis=1))
-    every = len(x) + len(points.corners)
-    only = jnp.asarray(np.concatenate([own, len(x) + carried, [every, every]]), jnp.int32)
+    blocks, rows = np.asarray(surface.cloth_blocks), np.concatenate([own, len(x) + carried])
+    groups = np.flatnonzero(np.isin(blocks, rows).any(axis=1))
+    only = jnp.asarray(np.concatenate([groups, [len(blocks)] * 2]), jnp.int32)
     whole, some = (evaluate_contact(x, StepInputs(body=body), surface, numbers, terms, only=rows) for rows in (None, only))
     np.testing.assert_allclose(some.gradient[own], whole.gradient[own], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(some.blocks[only[:-2]], whole.blocks[only[:-2]], rtol=0, atol=1e-6)
-    others = np.setdiff1d(np.arange(every), np.asarray(only))
-    assert not np.asarray(some.blocks)[others].any() and np.isinf(np.asarray(some.distance)[others]).all()
+    np.testing.assert_allclose(some.blocks[rows], whole.blocks[rows], rtol=0, atol=1e-6)
+    others = np.setdiff1d(np.arange(len(x) + len(points.corners)), blocks[groups])
+    assert len(others) and not np.asarray(some.blocks)[others].any() and np.isinf(np.asarray(some.distance)[others]).all()
     assert np.abs(whole.gradient[own]).max() > 1e-3
 
 

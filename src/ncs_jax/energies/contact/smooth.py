@@ -42,6 +42,7 @@ class BlendedContact(NamedTuple):
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
 ELSEWHERE = 0.15  # what a quadric counts, beside f, where another's sheet of the body is looked at; more than -min f = 1/8
+TOGETHER = 16  # groups of cloth in one turn of a loop
 SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
 
 
@@ -161,16 +162,28 @@ def blended_contact(
     each by itself: one mean of both would let what the one has to spare make good what the other misses. To the plane of the
     nearest vertex this is what a smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that
     rests there has no equilibrium.
-    `only`: of these vertices; otherwise of all.
+    `only`: of these groups of cloth, padded with how many there are; all others are taken as far away. Otherwise of all.
 
     The distance is the mean of d_i by w_i, and no greater than that of the nearest vertex. Source: Kolluri 2005 (implicit
     moving least squares), there for planes and one mean.
     """
-    near, cloth = quadrics, x[surface.cloth_blocks]
-    if only is not None:
-        near = jax.tree.map(lambda table: table[surface.cloth_place[only] // surface.cloth_blocks.shape[1]], quadrics)
-        cloth = x[only][:, None]
+    blocks = surface.cloth_blocks
+
+    def group(part):
+        return _blended(part[0], part[1], surface, thickness)
+
     # a few groups at a time, so that what lies between stays in the cache
-    result = lax.map(lambda part: _blended(part[0], part[1], surface, thickness), (cloth, near), batch_size=16)
-    flat = jax.tree.map(lambda table: table.reshape(-1, *table.shape[2:]), result)
-    return flat if only is not None else jax.tree.map(lambda table: table[surface.cloth_place], flat)
+    if only is None:
+        result = lax.map(group, (x[blocks], quadrics), batch_size=TOGETHER)
+        return jax.tree.map(lambda table: table.reshape(-1, *table.shape[2:])[surface.cloth_place], result)
+
+    def turn(k, every):
+        at = only.at[k * TOGETHER + jnp.arange(TOGETHER)].get(mode="fill", fill_value=len(blocks))
+        near = jax.tree.map(lambda table: table.at[at].get(mode="clip"), quadrics)
+        found = jax.vmap(group)((x[blocks.at[at].get(mode="clip")], near))
+        rows = blocks.at[at].get(mode="fill", fill_value=len(x))
+        return jax.tree.map(lambda table, some: table.at[rows].set(some, mode="drop"), every, found)
+
+    none = jnp.zeros_like(x)
+    far = BlendedContact(none[:, 0], none, none[:, :, None] * none[:, None], none[:, 0] + jnp.inf)
+    return lax.fori_loop(0, -(-jnp.sum(only < len(blocks)) // TOGETHER), turn, far)

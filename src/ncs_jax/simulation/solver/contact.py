@@ -41,8 +41,7 @@ def evaluate_contact(
 
     Args:
         x: positions in m. step: where the body is. near: the body near the garment, where contact is smooth and that is known.
-        only: of smooth contact, the vertices and points that count, padded with how many there are; the others are taken as far
-            away.
+        only: of smooth contact, the groups of cloth that count (see `blended_contact`); the others are taken as far away.
     """
     stiffness, points, body = material.collision, surface.points, required(step.body, "step.body")
     x = with_points(x, points)
@@ -56,14 +55,5 @@ def evaluate_contact(
     near = nearby_quadrics(x, body, surface) if near is None else near
 
     found = blended_contact(x, near, surface, material.thickness, only)
-    lost, gradient, blocks, distance = (
-        found.shortfall,
-        stiffness * found.slope,
-        2 * stiffness * found.directions,
-        found.distance,
-    )
-    if only is not None:
-        gradient = jnp.zeros_like(x).at[only].set(gradient, mode="drop")
-        blocks = jnp.zeros((*x.shape, 3), x.dtype).at[only].set(blocks, mode="drop")
-        distance = jnp.full(x.shape[:1], jnp.inf, x.dtype).at[only].set(distance, mode="drop")
-    return Contact(stiffness * jnp.sum(lost), on_vertices(gradient, points), blocks, distance)
+    gradient = on_vertices(stiffness * found.slope, points)
+    return Contact(stiffness * jnp.sum(found.shortfall), gradient, 2 * stiffness * found.directions, found.distance)

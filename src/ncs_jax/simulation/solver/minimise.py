@@ -69,7 +69,7 @@ def _on_patch(problem: Problem, patch: Patch) -> Problem:
     """Return the problem of a patch alone."""
     near, only = problem.neighbours, None
     if near is not None:
-        only = patch.touching
+        only = patch.groups
         near = near if near.pairs is None else near._replace(pairs=pairs_of(patch, near.pairs))
     return replace(problem, model=patch.model, couplings=patch.couplings, only=only, neighbours=near)
 

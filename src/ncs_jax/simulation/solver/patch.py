@@ -28,7 +28,7 @@ class Patch:
     """Vertices that move, and the model and couplings of every element that they touch; padded elements weigh nothing."""
 
     verts: Int[Array, "size"]
-    touching: Int[Array, "some"]  # those, then the points of contact that they carry, padded with how many there are of both
+    groups: Int[Array, "some"]  # of the surface's `cloth_blocks`, those with what moves, padded with how many there are
     place: Int[Array, "verts"]  # in `verts`, or `size` for a vertex that is held
     inside: Int[Array, "pairs"]  # pairs of vertices that both move; padded with the number of all pairs
     model: Model
@@ -45,14 +45,14 @@ def _take(array, rows, filling=0, axis=0):
     return jnp.take(array, rows, axis=axis, mode="fill", fill_value=filling)
 
 
-def _touching(verts, moves, couplings: Couplings):
-    """The vertices and the points of contact that move with any of them, padded, and whether they fit."""
-    points = couplings.points
-    if points is None:
-        return verts, jnp.asarray(True)
-    carried = jnp.any(moves[points.corners] & (points.weights > 0), axis=1)
-    rows, fits = _rows(carried, 2 * SIZE * -(-len(carried) // len(moves)))
-    return jnp.concatenate([verts, len(moves) + rows]), fits
+def _groups(moves, model: Model, couplings: Couplings):
+    """The groups of cloth that hold vertices that move, or points of contact that these carry, padded."""
+    if model.surface is None:
+        return jnp.zeros(0, jnp.int32)
+    points, blocks = couplings.points, model.surface.cloth_blocks
+    if points is not None:
+        moves = jnp.concatenate([moves, jnp.any(moves[points.corners] & (points.weights > 0), axis=1)])
+    return _rows(jnp.any(moves[blocks], axis=1), len(blocks))[0]
 
 
 def patch_around(score: Float[Array, "verts"], model: Model, couplings: Couplings) -> Patch:
@@ -68,7 +68,6 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
     hinges, fits_hinges = _rows(jnp.any(moves[mesh.hinges], axis=1), 6 * SIZE)
     edges, fits_edges = _rows(jnp.any(moves[mesh.edges], axis=1), 5 * SIZE)
     inside, fits_pairs = _rows(jnp.all(moves[couplings.pairs], axis=1), 8 * SIZE)
-    touching, fits_points = _touching(verts, moves, couplings)
     part = replace(
         mesh,
         faces=_take(mesh.faces, faces),
@@ -83,10 +82,9 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
         edge_weight=_take(mesh.edge_weight, edges),
         rings=None,
     )
-    whole = fits_faces & fits_hinges & fits_edges & fits_pairs
     return Patch(
         verts=verts,
-        touching=touching,
+        groups=_groups(moves, model, couplings),
         place=place,
         inside=inside,
         model=replace(model, garment=replace(model.garment, mesh=part)),
@@ -100,7 +98,7 @@ def patch_around(score: Float[Array, "verts"], model: Model, couplings: Coupling
             couplings.points,
             couplings.point_pairs,
         ),
-        whole=whole & fits_points,
+        whole=fits_faces & fits_hinges & fits_edges & fits_pairs,
     )
 
 
