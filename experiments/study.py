@@ -166,13 +166,15 @@ def simulation_file(twin: Scene, motion: str, kept: Path) -> Path:
 def reference(scene: Scene, motion: str, kept: Path, twin: str = "dynamic") -> np.ndarray:
     """The scene's garment simulated over a motion, (frames, verts, 3) in m, as one of its `twins`.
 
-    Made once, and read from the folder after that.
+    Made once, and read from the folder after that; where it was interrupted it goes on.
     """
     alike = twins(scene)[twin]
     file = simulation_file(alike, motion, kept)
+    partial = file.with_suffix(".partial.npz")
     with one_at_a_time(file):
         if not file.exists():
-            write_npz(file, vertices=simulate(alike, motion).vertices)
+            write_npz(file, vertices=simulate(alike, motion, partial=partial).vertices)
+            partial.unlink(missing_ok=True)
     with np.load(file, allow_pickle=False) as arrays:
         return arrays["vertices"]
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import plane_distance, triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle, nearest_vertex
-from ncs_jax.energies.contact.smooth import TOGETHER, blended_contact, curvatures, nearby_quadrics
+from ncs_jax.energies.contact.smooth import TOGETHER, blended_contact, contact_within_reach, curvatures, nearby_quadrics
 from ncs_jax.energies.contact.surface import rebuild_lists, surface_from, vertex_normals
 from ncs_jax.geometry.closest_point import closest_weights
 
@@ -467,11 +467,11 @@ def test_smooth_contact_is_the_formula_over_all_vertices(name):
 
 @jax.jit
 def contact_of_some(x, body, surface, some):
-    return blended_contact(x, nearby_quadrics(x, body, surface), surface, THICKNESS, some)
+    return contact_within_reach(x, nearby_quadrics(x, body, surface), surface, THICKNESS, some)
 
 
 def test_smooth_contact_of_some_groups_is_theirs():
-    """Of more groups than are looked at in one turn, in any order; all others are far away."""
+    """Of more groups than are looked at in one turn; no other touches anything."""
     x, vertices, faces = near_skin("ball")
     surface = surface_from(x, vertices, faces, smooth=True)
     count = len(surface.cloth_blocks)
@@ -479,10 +479,35 @@ def test_smooth_contact_of_some_groups_is_theirs():
     assert len(some) < count
     rows = np.unique(surface.cloth_blocks[some])
     others = np.setdiff1d(np.arange(len(x)), rows)
-    found = contact_of_some(x, vertices, surface, np.concatenate([some, [count, count]]))
+    found = contact_of_some(x, vertices, surface, np.isin(np.arange(count), some))
     for part, every in zip(found, contact(x, x, vertices, surface)[0], strict=True):
         np.testing.assert_allclose(part[rows], np.asarray(every)[rows], rtol=1e-9, atol=1e-15)
-    assert np.isinf(found.distance[others]).all() and not any(np.asarray(part)[others].any() for part in found[:3])
+    assert not any(np.asarray(part)[others].any() for part in found[:3])
+
+
+def test_cloth_that_is_too_far_to_touch_is_not_looked_at():
+    """Nothing is lost by it: neither deep inside, nor where cloth has come near since the body was looked at."""
+    vertices, faces = ball(4)
+    rng, h = np.random.default_rng(3), mean_edge(vertices, faces)
+    way = np.array([[0.0, 0.6, 0.8], [0.6, 0.8, 0.0], [-0.8, 0.0, 0.6], [0.0, -1.0, 0.0]])
+    height = np.array([1e-3, 6 * h, 6 * h, -8 * h])  # on the skin, far twice, deep inside
+    x = ((0.1 + height[:, None]) * way)[:, None] + rng.uniform(-0.01, 0.01, (4, POINTS, 3))
+    come = np.where(np.arange(4) == 2, 5 * h, 0)[:, None, None] * way[:, None]
+    x, now = x.reshape(-1, 3), (x - come).reshape(-1, 3)
+    surface = surface_from(x, vertices, faces, smooth=True)
+
+    @jax.jit
+    def both(x, now):
+        near = nearby_quadrics(x, jnp.asarray(vertices), surface)
+        return [find(now, near, surface, THICKNESS) for find in (blended_contact, contact_within_reach)]
+
+    whole, some = both(x, now)
+    for part, every in zip(some[:3], whole[:3], strict=True):
+        np.testing.assert_allclose(part, every, rtol=1e-9, atol=1e-15)
+    skipped = np.asarray(some.distance) != np.asarray(whole.distance)
+    assert skipped[POINTS : 2 * POINTS].mean() > 0.9 and not np.delete(skipped, np.s_[POINTS : 2 * POINTS]).any()
+    assert (some.distance[skipped] > 3 * h).all() and (some.distance <= whole.distance + 1e-12).all()
+    assert (np.asarray(whole.shortfall).reshape(4, -1).max(axis=1) > 0).tolist() == [True, False, True, True]
 
 
 def test_curvatures_of_a_ball_and_of_a_tube_and_of_a_floor():

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ncs_jax.energies.contact.nearest import nearest_groups
 from ncs_jax.energies.contact.surface import Surface, vertex_normals
 from ncs_jax.geometry.numerics import norm, normalize
 
-__all__ = ["BlendedContact", "Quadrics", "blended_contact", "curvatures", "nearby_quadrics"]
+__all__ = ["BlendedContact", "Quadrics", "blended_contact", "contact_within_reach", "curvatures", "nearby_quadrics"]
 
 
 @jax.tree_util.register_dataclass
@@ -29,6 +29,8 @@ class Quadrics:
     normals: Float[Array, "*blocks near 3"]
     offsets: Float[Array, "*blocks 1 near"]  # n . (b - centre)
     bends: Float[Array, "*blocks near 10"]  # coefficients of (x - b) . S (x - b) / 2
+    cloth: Float[Array, "*blocks size 3"]  # where the group was looked at
+    clear: Float[Array, "*blocks"]  # how far from every vertex of the body it was at least; 0 where it may be inside
 
 
 class BlendedContact(NamedTuple):
@@ -43,6 +45,7 @@ class BlendedContact(NamedTuple):
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
 ELSEWHERE = 0.15  # what a quadric counts, beside f, where another's sheet of the body is looked at; more than -min f = 1/8
 TOGETHER = 16  # groups of cloth in one turn of a loop
+REACH = 3.5  # mean edge lengths of the body from a vertex: beyond, outside, its quadric says of nothing that it touches
 SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
 
 
@@ -88,7 +91,17 @@ def nearby_quadrics(x: Float[Array, "verts 3"], body: Float[Array, "body 3"], su
     second = jnp.stack([bend[..., i, j] * (0.5 if i == j else 1) for i, j in PAIRS], axis=-1)
     bends = jnp.concatenate([second, -turn, jnp.sum(turn * points, axis=-1, keepdims=True) / 2], axis=-1)
     squares = jnp.where(once, jnp.sum(points * points, axis=-1), 1e6)  # m^2: nothing weighs anything so far away
-    return Quadrics(centres, points, squares[:, None], n, jnp.sum(n * points, axis=-1)[:, None], bends)
+    offsets = jnp.sum(n * points, axis=-1)
+    clear = _clear(cloth, lax.stop_gradient(body)[blocks[chosen[:, 0]]], lax.stop_gradient(squares), lax.stop_gradient(offsets))
+    return Quadrics(centres, points, squares[:, None], n, offsets[:, None], bends, cloth, clear)
+
+
+def _clear(cloth, nearest, squares, offsets):
+    """How far groups of cloth (blocks, size, 3) are from the nearest ones of the body; 0 where the centre may be inside."""
+    gap = jnp.maximum(nearest.min(axis=1) - cloth.max(axis=1), cloth.min(axis=1) - nearest.max(axis=1))
+    row = jnp.argmin(squares, axis=1)[:, None]
+    height, square = -jnp.take_along_axis(offsets, row, axis=1)[:, 0], jnp.take_along_axis(squares, row, axis=1)[:, 0]
+    return jnp.where(2 * height > jnp.sqrt(square), norm(jnp.maximum(gap, 0)), 0)
 
 
 def _blended(cloth, near, surface, thickness) -> BlendedContact:
@@ -147,7 +160,6 @@ def blended_contact(
     quadrics: Quadrics,
     surface: Surface,
     thickness: Float[Array, ""] | float,
-    only: Int[Array, "some"] | None = None,
 ) -> BlendedContact:
     """Return the contact with a smooth body: with the second-order tangent surfaces of all its vertices near x, blended.
 
@@ -162,28 +174,43 @@ def blended_contact(
     each by itself: one mean of both would let what the one has to spare make good what the other misses. To the plane of the
     nearest vertex this is what a smooth hill is to a stair: that one jumps where the nearest vertex changes, so cloth that
     rests there has no equilibrium.
-    `only`: of these groups of cloth, padded with how many there are; all others are taken as far away. Otherwise of all.
 
     The distance is the mean of d_i by w_i, and no greater than that of the nearest vertex. Source: Kolluri 2005 (implicit
     moving least squares), there for planes and one mean.
     """
-    blocks = surface.cloth_blocks
-
-    def group(part):
-        return _blended(part[0], part[1], surface, thickness)
-
     # a few groups at a time, so that what lies between stays in the cache
-    if only is None:
-        result = lax.map(group, (x[blocks], quadrics), batch_size=TOGETHER)
-        return jax.tree.map(lambda table: table.reshape(-1, *table.shape[2:])[surface.cloth_place], result)
+    parts = x[surface.cloth_blocks], quadrics
+    result = lax.map(lambda part: _blended(part[0], part[1], surface, thickness), parts, batch_size=TOGETHER)
+    return jax.tree.map(lambda table: table.reshape(-1, *table.shape[2:])[surface.cloth_place], result)
+
+
+def contact_within_reach(
+    x: Float[Array, "verts 3"],
+    quadrics: Quadrics,
+    surface: Surface,
+    thickness: Float[Array, ""] | float,
+    only: Bool[Array, "blocks"] | None = None,
+) -> BlendedContact:
+    """Return `blended_contact` without a look at cloth that is too far from the body to touch it; it has no derivative.
+
+    There the distance is how far it is from every vertex of the body, at least. only: groups of cloth that are looked at, and
+    no others.
+    """
+    blocks, count = surface.cloth_blocks, len(surface.cloth_blocks)
+    cloth = x[blocks]
+    left = quadrics.clear - jnp.sqrt(jnp.max(jnp.sum((cloth - quadrics.cloth) ** 2, axis=-1), axis=1))
+    near = left < REACH * surface.spacing.astype(x.dtype) + thickness
+    near = near if only is None else near & only
+    todo = jnp.nonzero(near, size=count, fill_value=count)[0]
 
     def turn(k, every):
-        at = only.at[k * TOGETHER + jnp.arange(TOGETHER)].get(mode="fill", fill_value=len(blocks))
-        near = jax.tree.map(lambda table: table.at[at].get(mode="clip"), quadrics)
-        found = jax.vmap(group)((x[blocks.at[at].get(mode="clip")], near))
+        at = todo.at[k * TOGETHER + jnp.arange(TOGETHER)].get(mode="fill", fill_value=count)
+        some = jax.tree.map(lambda table: table.at[at].get(mode="clip"), (cloth, quadrics))
+        found = jax.vmap(lambda cloth, near: _blended(cloth, near, surface, thickness))(*some)
         rows = blocks.at[at].get(mode="fill", fill_value=len(x))
         return jax.tree.map(lambda table, some: table.at[rows].set(some, mode="drop"), every, found)
 
     none = jnp.zeros_like(x)
-    far = BlendedContact(none[:, 0], none, none[:, :, None] * none[:, None], none[:, 0] + jnp.inf)
-    return lax.fori_loop(0, -(-jnp.sum(only < len(blocks)) // TOGETHER), turn, far)
+    distance = none[:, 0].at[blocks].set(jnp.maximum(left, 0)[:, None])
+    start = BlendedContact(none[:, 0], none, none[:, :, None] * none[:, None], distance)
+    return lax.fori_loop(0, -(-jnp.sum(near) // TOGETHER), turn, start)

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.points import on_vertices, with_points
-from ncs_jax.energies.contact.smooth import Quadrics, blended_contact, nearby_quadrics
+from ncs_jax.energies.contact.smooth import Quadrics, contact_within_reach, nearby_quadrics
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.energies.terms import Material, StepInputs, Terms
 from ncs_jax.energies.total import distances
@@ -35,13 +35,13 @@ def evaluate_contact(
     material: Material,
     terms: Terms,
     near: Quadrics | None = None,
-    only: Int[Array, "some"] | None = None,
+    only: Bool[Array, "blocks"] | None = None,
 ) -> Contact:
     """Return the contact of all vertices and of the points between them, each of which touches the body by itself.
 
     Args:
         x: positions in m. step: where the body is. near: the body near the garment, where contact is smooth and that is known.
-        only: of smooth contact, the groups of cloth that count (see `blended_contact`); the others are taken as far away.
+        only: of smooth contact, the groups of cloth that are looked at; the others touch nothing.
     """
     stiffness, points, body = material.collision, surface.points, required(step.body, "step.body")
     x = with_points(x, points)
@@ -54,6 +54,6 @@ def evaluate_contact(
         return Contact(energy, on_vertices(slope[:, None] * normal, points), blocks, distance)
     near = nearby_quadrics(x, body, surface) if near is None else near
 
-    found = blended_contact(x, near, surface, material.thickness, only)
+    found = contact_within_reach(x, near, surface, material.thickness, only)
     gradient = on_vertices(stiffness * found.slope, points)
     return Contact(stiffness * jnp.sum(found.shortfall), gradient, 2 * stiffness * found.directions, found.distance)

@@ -28,7 +28,7 @@ class Patch:
     """Vertices that move, and the model and couplings of every element that they touch; padded elements weigh nothing."""
 
     verts: Int[Array, "size"]
-    groups: Int[Array, "some"]  # of the surface's `cloth_blocks`, those with what moves, padded with how many there are
+    groups: Bool[Array, "blocks"]  # of the surface's `cloth_blocks`: whether something moves
     place: Int[Array, "verts"]  # in `verts`, or `size` for a vertex that is held
     inside: Int[Array, "pairs"]  # pairs of vertices that both move; padded with the number of all pairs
     model: Model
@@ -46,13 +46,13 @@ def _take(array, rows, filling=0, axis=0):
 
 
 def _groups(moves, model: Model, couplings: Couplings):
-    """The groups of cloth that hold vertices that move, or points of contact that these carry, padded."""
+    """Which groups of cloth hold vertices that move, or points of contact that these carry."""
     if model.surface is None:
-        return jnp.zeros(0, jnp.int32)
-    points, blocks = couplings.points, model.surface.cloth_blocks
+        return jnp.zeros(0, bool)
+    points = couplings.points
     if points is not None:
         moves = jnp.concatenate([moves, jnp.any(moves[points.corners] & (points.weights > 0), axis=1)])
-    return _rows(jnp.any(moves[blocks], axis=1), len(blocks))[0]
+    return jnp.any(moves[model.surface.cloth_blocks], axis=1)
 
 
 def patch_around(score: Float[Array, "verts"], model: Model, couplings: Couplings) -> Patch:

@@ -80,7 +80,7 @@ class Problem:
     inputs: StepInputs  # with `moving` 0 where inertia is left out, and the frame is static
     pinned: Float[Array, "pins 3"] | None = None  # where the pins are held, if exactly
     neighbours: Neighbours | None = None
-    only: Int[Array, "some"] | None = None  # of a patch: the groups of cloth, as the surface has them, in which something moves
+    only: Bool[Array, "blocks"] | None = None  # of a patch: in which groups of cloth, as the surface has them, something moves
     first: Bool[Array, ""] | None = None  # whether no frame was before; None: a static one is taken for that
     limit: Int[Array, ""] | None = None  # of iterations; None: the settings'
 
