@@ -170,7 +170,7 @@ def reference(scene: Scene, motion: str, kept: Path, twin: str = "dynamic") -> n
     """
     alike = twins(scene)[twin]
     file = simulation_file(alike, motion, kept)
-    partial = file.with_suffix(".partial.npz")
+    partial = file.with_name(f"{file.stem}-{named(alike.to_dict())}.partial.npz")  # of this scene: others may share the file
     with one_at_a_time(file):
         if not file.exists():
             write_npz(file, vertices=simulate(alike, motion, partial=partial).vertices)

@@ -156,6 +156,30 @@ def test_the_page_is_what_its_tables_say():
     assert whole.page(folder / "results") == (folder / "README.md").read_text()
 
 
+def test_an_interrupted_reference_goes_on_and_is_in_no_other_scene_s_way(tmp_path, monkeypatch):
+    """Scenes with other networks share the simulation, but not what a simulation of the one has begun."""
+    scene = load_scene("ncs:skirt")
+    other = study.changed(scene, network={"method": "pbns"})
+    assert study.simulation_file(scene, "ncs:walk", tmp_path) == study.simulation_file(other, "ncs:walk", tmp_path)
+    given = []
+
+    def interrupted(scene, motion, partial):
+        given.append((partial, partial.exists()))
+        partial.touch()
+        if len(given) < 3:
+            raise KeyboardInterrupt
+        return SimpleNamespace(vertices=np.ones((2, 3, 3)))
+
+    monkeypatch.setattr(study, "simulate", interrupted)
+    for one in (scene, other):
+        with pytest.raises(KeyboardInterrupt):
+            study.reference(one, "ncs:walk", tmp_path)
+    assert study.reference(scene, "ncs:walk", tmp_path).shape == (2, 3, 3)
+    (first, _), (second, there), (again, continued) = given
+    assert first == again != second and continued and not there and not first.exists() and second.exists()
+    np.testing.assert_array_equal(study.reference(other, "ncs:walk", tmp_path), 1)
+
+
 def test_methods(alone, tmp_path, monkeypatch):
     monkeypatch.setattr(study, "COARSE", 50.0)  # g: what few iterations reach, and stop at
     rows = studied(methods, tmp_path, text=FREE.replace("smoothing = 2", 'smoothing = 2\npins = "pins"'))

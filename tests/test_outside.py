@@ -90,7 +90,7 @@ def test_what_the_plane_of_the_nearest_vertex_calls_inside_stays_where_it_is_out
 
 @pytest.mark.parametrize("poses", [1, 3])
 def test_few_points_find_their_triangle(rng, poses):
-    """As a search of all of them does, but for what is too far from any to matter."""
+    """Near the skin, as a search of all of them does."""
     body = np.stack([BALL * rng.uniform(0.8, 1.2, 3) for _ in range(poses)], axis=2)
     pose = np.arange(200) % poses
     x = body[rng.integers(len(BALL), size=200), :, pose] + rng.normal(size=(200, 3)) * 0.01

@@ -20,7 +20,7 @@ __all__ = ["put_outside"]
 
 ROUNDS = 3
 NEAR, FAR = 0.02, 0.04  # m from the skin: up to where its normal there says what is inside, and from where it does not
-FEW = 64  # points of a pose that are looked at in one turn
+AT_ONCE = 64  # points that are looked at in one turn, for each pose
 
 
 def put_outside(
@@ -35,19 +35,20 @@ def put_outside(
 
         x_k <- x_k + sum_p w_pk s_p n_p / sum_{p: s_p > 0} w_pk,    s_p = c_p max(margin - n_p . (x_p - b_p), 0)
 
-    `ROUNDS` times. b_p is the point of the body nearest to p and n_p the normal there, that of the vertices of its triangle by
-    their weights; w_pk is how much of p its corner k carries: a point alone is moved onto the plane that is the margin off the
-    skin, and several that share a corner move it by their mean. c_p is `skin` at the triangle's nearest corner, less where p is
-    farther from b_p than `NEAR`, and 0 beyond `FAR`. So cloth that lies deeper stays where it is.
+    `ROUNDS` times. b_p is the point of the body nearest to p (`nearest_of_few`) and n_p the normal there, that of the vertices
+    of its triangle by their weights; w_pk is how much of p its corner k carries: a point alone is moved onto the plane that is
+    the margin off the skin, and several that share a corner move it by their mean. c_p is `skin` at the corner that b_p is most
+    of, less where p is farther from b_p than `NEAR`, and 0 beyond `FAR`. So cloth that lies deeper stays where it is.
 
-    b_p is looked for where p comes below the margin over the plane of the vertex that it touches, and s_p is 0 elsewhere. That
+    b_p is looked for where p comes below the margin over the plane of a vertex that pushes, and s_p is 0 elsewhere. That
     plane alone would not do: where an arm hangs beside the trunk, it is of the one or the other by chance.
 
     Args:
         x, body: in one pose or several. surface: of both. skin: 1 for vertices of the body that push, 0 for others. rims: the
             ways out of its rim, beyond which nothing pushes.
 
-    It has no memory and no velocity: each frame is mended by itself. Cf. Mueller et al. 2007, Position Based Dynamics.
+    It has no memory, no velocity and no derivative: each frame is mended by itself. Cf. Mueller et al. 2007, Position Based
+    Dynamics.
     """
     shape = x.shape
     x, body = x.reshape(*x.shape[:2], -1), body.reshape(*body.shape[:2], -1)
@@ -73,7 +74,7 @@ def put_outside(
         p = with_points(x, surface.points)
         index = touched(p, body, surface)
         may = (skin[index] > 0) & (plane_distance(p, body, normals, index) < margin)
-        ways = _of_those(may, lambda at: short(p, at), FEW * poses).reshape(len(p), poses, 3)
+        ways = _of_those(may, lambda at: short(p, at), AT_ONCE * poses, x.dtype).reshape(len(p), poses, 3)
         moved = on_vertices(jnp.moveaxis(ways, 1, 2), surface.points)
         carried = on_vertices(jnp.any(ways != 0, axis=2)[:, None].astype(x.dtype), surface.points)
         return x + jnp.where(carried > 0, moved / jnp.where(carried > 0, carried, 1), 0)
@@ -87,7 +88,7 @@ def _mixed(weights, vectors):
 
 
 def _of_those(
-    wanted: Bool[Array, "..."], look: Callable[[Int[Array, "few"]], Float[Array, "few 3"]], few: int
+    wanted: Bool[Array, "..."], look: Callable[[Int[Array, "few"]], Float[Array, "few 3"]], few: int, dtype
 ) -> Float[Array, "all 3"]:
     """Return what `look` says of the numbers of those that are wanted, so few at a time; zero for all others."""
     every = wanted.size
@@ -98,5 +99,4 @@ def _of_those(
         at = lax.dynamic_slice_in_dim(todo, k * few, few)
         return found.at[at].set(look(jnp.minimum(at, every - 1)), mode="drop")
 
-    start = jnp.zeros((every, 3), look(todo[:few] * 0).dtype)
-    return lax.fori_loop(0, -(-jnp.sum(wanted) // few), turn, start)
+    return lax.fori_loop(0, -(-jnp.sum(wanted) // few), turn, jnp.zeros((every, 3), dtype))

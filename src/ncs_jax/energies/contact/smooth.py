@@ -21,7 +21,7 @@ __all__ = ["BlendedContact", "Quadrics", "blended_contact", "contact_within_reac
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Quadrics:
-    """The body near every group of cloth, for `blended_contact`: one quadric a body vertex, seen from the group's centre, m."""
+    """The body near every group of cloth: one quadric a body vertex, seen from the group's centre, m; and how far that is."""
 
     centres: Float[Array, "*blocks 1 3"]
     points: Float[Array, "*blocks near 3"]  # the body's vertices
@@ -39,13 +39,13 @@ class BlendedContact(NamedTuple):
     shortfall: Float[Array, "*some"]  # m^2: square of what is missing of the distance to keep
     slope: Float[Array, "*some 3"]  # m: its derivative
     directions: Float[Array, "*some 3 3"]  # about half of its second derivative
-    distance: Float[Array, "*some"]  # m, negative inside
+    distance: Float[Array, "*some"]  # m, negative inside; of cloth that is not looked at, what it is at least
 
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of the axes
 ELSEWHERE = 0.15  # what a quadric counts, beside f, where another's sheet of the body is looked at; more than -min f = 1/8
 TOGETHER = 16  # groups of cloth in one turn of a loop
-REACH = 3.5  # mean edge lengths of the body from a vertex: beyond, outside, its quadric says of nothing that it touches
+REACH = 3.5  # mean edge lengths from a vertex: beyond and outside, d > 1.6 of them however sharp the bend (e pushes it off)
 SHARPEST = 0.7  # curvature times the body's mean edge length: the tightest bend that its mesh can show
 
 
@@ -101,7 +101,8 @@ def _clear(cloth, nearest, squares, offsets):
     gap = jnp.maximum(nearest.min(axis=1) - cloth.max(axis=1), cloth.min(axis=1) - nearest.max(axis=1))
     row = jnp.argmin(squares, axis=1)[:, None]
     height, square = -jnp.take_along_axis(offsets, row, axis=1)[:, 0], jnp.take_along_axis(squares, row, axis=1)[:, 0]
-    return jnp.where(2 * height > jnp.sqrt(square), norm(jnp.maximum(gap, 0)), 0)
+    outside = 2 * height > jnp.sqrt(square)  # within 60 degrees of the nearest vertex's normal, and not past a rim
+    return jnp.where(outside, norm(jnp.maximum(gap, 0)), 0)
 
 
 def _blended(cloth, near, surface, thickness) -> BlendedContact:
@@ -193,8 +194,8 @@ def contact_within_reach(
 ) -> BlendedContact:
     """Return `blended_contact` without a look at cloth that is too far from the body to touch it; it has no derivative.
 
-    There the distance is how far it is from every vertex of the body, at least. only: groups of cloth that are looked at, and
-    no others.
+    There the distance is how far it is from every vertex of the body, at least; 0 where that is not known. only: groups of
+    cloth that are looked at, and no others. `tests/test_collision.py` holds both equal.
     """
     blocks, count = surface.cloth_blocks, len(surface.cloth_blocks)
     cloth = x[blocks]

@@ -25,7 +25,7 @@ class Contact(NamedTuple):
     energy: Float[Array, ""]  # J
     gradient: Float[Array, "verts 3"]  # N
     blocks: Float[Array, "points 3 3"]  # N/m, of vertices, then of the points between them
-    distance: Float[Array, "points"]  # m, of both
+    distance: Float[Array, "points"]  # m, of both; what it is at least where smooth contact has not looked
 
 
 def evaluate_contact(
