@@ -540,7 +540,8 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     monkeypatch.setattr("ncs_jax.view.pictures.render", lambda *_, **__: np.zeros((520, 400, 3), np.uint8))
     shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
     monkeypatch.setattr("ncs_jax.view.preview.MEASURED", 8)
-    monkeypatch.setattr("ncs_jax.view.preview.BARE", 0.5)  # mm: cloth is put out of the post as far as its twelve sides tell
+    # what is put outside of the post is so in all frames
+    monkeypatch.setattr("ncs_jax.runs.outside.pushing", lambda model: np.zeros(len(model.surface.rings), np.float32))
     out = tmp_path / "drawn"
     assert main(["preview", str(folder), "--out", f"{out}.png"]) == 2 and not Path(f"{out}.png").exists()
     assert "a folder expected" in capsys.readouterr().err
@@ -561,7 +562,7 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     np.testing.assert_allclose(quick["penetrating"], rows["penetrating"][::every].mean(), atol=1e-6)
     np.testing.assert_allclose(quick["depth_max"], rows["depth_max"][::every].max(), atol=1e-2)
     deepest = np.max([rows[f"{part}depth_max"] for part in ("", "middle_", "centre_")], axis=0)[::every]
-    bare, worst = int((deepest > 0.5).sum()), every * int(deepest.argmax())
+    bare, worst = int((deepest > 1).sum()), every * int(deepest.argmax())
     assert bare > 0 and (quick["bare"], quick["barest"], quick["measured"]) == (bare, worst, len(deepest))
     shows = f"skin shows by 1 mm in {bare} of {len(deepest)} frames that were measured"
     assert f"{shows}, at most {deepest.max():.1f} mm outside the cloth in frame {worst}" in text
