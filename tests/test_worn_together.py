@@ -287,7 +287,8 @@ def test_garments_of_one_file(folder, worn):
     """As an outfit is exported: a mesh of its own for each; the model is that of two files."""
     lines, count = [], 1
     for name in ("inner", "outer"):
-        arrays = np.load(folder / f"{name}.npz")
+        with np.load(folder / f"{name}.npz") as table:
+            arrays = dict(table)
         lines += [f"o {name}", *("v {:.9g} {:.9g} {:.9g}".format(*v) for v in arrays["vertices"])]
         lines += ["f {} {} {}".format(*(f + count)) for f in arrays["faces"]]
         count += len(arrays["vertices"])
