@@ -92,6 +92,17 @@ def test_a_track_prints_in_a_line_which_frames_are_which_motion():
     assert inside[0].startswith("MotionFeatures(start=")  # traced: no numbers to tell
 
 
+def test_the_middle_frame_is_no_raised_leg_wherever_it_stands():
+    """Forward: the mean of all frames, by hand."""
+    poses = np.random.default_rng(0).normal(0, 0.2, (9, 3, 6)).astype(np.float32)
+    poses[0] += 2  # a pose like no other, with which the motion begins
+    zeros, start = jnp.zeros((9, 3, 4)), jnp.zeros(9, int)
+    found = MotionFeatures(jnp.asarray(poses), zeros, jnp.zeros((9, 4, 3, 4)), start).middle()
+    assert found == np.linalg.norm((poses - poses.mean(axis=0)).reshape(9, -1), axis=1).argmin() != 0
+    assert MotionFeatures(jnp.asarray(poses[::-1]), zeros, jnp.zeros((9, 4, 3, 4)), start).middle() == 8 - found
+    assert MotionFeatures(zeros[:, :0], zeros[:, :0], jnp.zeros((9, 4, 3, 4)), start).middle() == 0  # no joint is read
+
+
 def test_the_mirrored_character_wears_its_skin_mirrored(rng):
     """Skinned points too, whose weights are each other's image."""
     x = rng.normal(size=(20, 3))

@@ -226,7 +226,7 @@ def _with_vibrations(scene: Scene, prepared: Prepared, model: Model, faces, trac
 
     def found() -> dict[str, np.ndarray] | None:
         begin()
-        modes = softest_ritz_modes(smooth, track, count)
+        modes = softest_ritz_modes(smooth, track.matrices[track.middle()], count)
         if modes is None:
             return None
         modes = replace(modes, by_pose=as_about_the_drape(model, count))

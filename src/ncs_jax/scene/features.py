@@ -45,6 +45,11 @@ class MotionFeatures:
         shown = ", ".join(spans if len(spans) <= 6 else [*spans[:5], "...", spans[-1]])
         return f"MotionFeatures({len(start)} frames, {self.matrices.shape[-3]} joints, {len(spans)} motions: frames {shown})"
 
+    def middle(self) -> int:
+        """Return the frame whose pose, by the static descriptors, is nearest to the mean of all frames."""
+        away = np.asarray(self.static, np.float64)
+        return int(np.square(away - away.mean(axis=0)).sum(axis=(1, 2)).argmin())
+
     def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
         """Return positions measured from the track's origin, in the world, m."""
         return x if self.origin is None else x + self.origin[:, None]

@@ -45,7 +45,7 @@ class RitzModes:
     d_l, of which the root is how much it turns and strains, r.m.s.; and what training shows of it, see `methods.swing`. None
     in a run of an earlier version, whose swing has no bounds. by_pose: how stiff the garment is along them in a pose, a linear
     map of its descriptors, its constant, and between what it was seen, see `runs.pose_stiffness`; None: as about the drape.
-    drape: offsets (verts, 3) in unposed space of the garment as it hangs in the first pose, m, where a training begins.
+    drape: offsets (verts, 3) in unposed space of the garment as it hangs in the training's middle pose, m, where that begins.
     """
 
     directions: Float[Array, "verts 3 modes"]

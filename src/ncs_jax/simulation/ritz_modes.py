@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ncs_jax.energies.terms import StepInputs
 from ncs_jax.errors import required
@@ -18,7 +18,6 @@ from ncs_jax.geometry.laplacian_modes import modal_basis
 from ncs_jax.geometry.mesh import Mesh
 from ncs_jax.geometry.numerics import normalize
 from ncs_jax.geometry.skinning import blend, skin, unpose
-from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
 from ncs_jax.scene.step_inputs import Past, step_inputs
 from ncs_jax.simulation.solver.problem import (
@@ -205,12 +204,12 @@ def _drape(problem: Problem, x, mass):
     return None
 
 
-def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzModes | None:
+def softest_ritz_modes(model: Model, matrices: Float[Array, "joints 3 4"], count: int) -> RitzModes | None:
     """Return the `count` softest vibrations of a garment among those that smooth inertia forces excite.
 
     Such a force is a mass times a smooth mode b_j (`laplacian_modes.modal_basis`) along an axis e_i. What it does to the drape
-    x_0, the static equilibrium in the first frame of a track, is a load-dependent Ritz vector u_ij. The vibrations are made of
-    those:
+    x_0, the static equilibrium in the pose of the joints' `matrices`, is a load-dependent Ritz vector u_ij. The vibrations are
+    made of those:
 
         (K + s M) u_ij = M b_j e_i,   K V = M V w^2 on the span of all u_ij,   d_k = c_k R^-1 v_k
 
@@ -227,7 +226,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     from scipy.sparse import diags
 
     still = functools.partial(_still, model, _couplings(model))
-    problem, transforms = still(track.matrices[0])
+    problem, transforms = still(matrices)
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
     held = np.asarray(model.garment.pins) if model.terms.pinning else ()
@@ -238,7 +237,7 @@ def softest_ritz_modes(model: Model, track: MotionFeatures, count: int) -> RitzM
     masses = diags(np.repeat(mass, 3))
     least = (2 * np.pi * LEAST) ** 2 / max(1.0, np.ptp(rest, axis=0).max() / TALL)
 
-    worn, led = (_skin(transforms, x) for x in (mesh.rest, _walked(model, track.matrices[0], mass, still)))
+    worn, led = (_skin(transforms, x) for x in (mesh.rest, _walked(model, matrices, mass, still)))
     drape = _drape(problem, led, mass)
     if drape is None:
         return None
