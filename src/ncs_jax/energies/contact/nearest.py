@@ -263,6 +263,9 @@ def nearest_of_few(
 
 
 def rows_at(table: Float[Array, "rows 3 poses"], row: Int[Array, "*#some"], pose: Int[Array, "*#some"]) -> Vector:
-    """Return three components of rows of a table in the poses named, each gathered by itself."""
+    """Return three components of rows of a table in the poses named.
+
+    Each by itself, which on a CPU is gathered several times faster than rows of three.
+    """
     at = row * table.shape[2] + pose
     return [table[:, i].reshape(-1).at[at].get(mode="promise_in_bounds") for i in range(3)]
