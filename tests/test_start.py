@@ -117,9 +117,11 @@ def test_a_program_is_compiled_once_and_ahead_for_arguments_of_which_the_shapes_
 
 
 def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path, plain_jax, monkeypatch):
-    """No vibration is really looked for. Else training would compile its steps twice."""
+    """No vibration is really looked for. Else training would compile its steps twice. They are those of the middle pose."""
+    poses = []
 
-    def found(model, track, count):
+    def found(model, matrices, count):
+        poses.append(np.asarray(matrices))
         draw = np.random.default_rng(0).normal(size=(len(model.basis), 3, count)) / 100
         slope, drape = jnp.eye(count, dtype=jnp.float32), jnp.asarray(draw[:, :, 0], jnp.float32)
         return RitzModes(jnp.asarray(draw, jnp.float32), jnp.float32(0.01), slope, drape=drape)
@@ -133,13 +135,15 @@ def test_what_is_expected_while_vibrations_are_looked_for_is_what_comes(tmp_path
     flat = [jax.tree.flatten((a.model, a.training_features)) for a in (begun[0], whole)]
     kinds = [([(leaf.shape, leaf.dtype) for leaf in leaves], structure) for leaves, structure in flat]
     assert kinds[0] == kinds[1]
+    assert whole.track.middle() > 0
+    np.testing.assert_array_equal(poses, whole.track.matrices[whole.track.middle()][None])
 
 
 def test_a_run_from_anothers_weights_looks_for_no_vibrations_where_garment_and_physics_are_the_same(tmp_path, plain_jax):
     """They are that run's, and so is the network. With another material they are looked for."""
     looked, draw = [], np.random.default_rng(0)
 
-    def found(model, track, count):
+    def found(model, matrices, count):
         looked.append(model)
         directions = jnp.asarray(draw.normal(size=(len(model.basis), 3, count)) / 100, jnp.float32)
         return RitzModes(directions, jnp.float32(0.01), jnp.eye(count, dtype=jnp.float32), drape=directions[:, :, 0])
