@@ -47,8 +47,8 @@ class MotionFeatures:
 
     def middle(self) -> int:
         """Return the frame whose pose, by the static descriptors, is nearest to the mean of all frames."""
-        away = np.asarray(self.static, np.float64)
-        return int(np.square(away - away.mean(axis=0)).sum(axis=(1, 2)).argmin())
+        poses = np.asarray(self.static, np.float64)
+        return int(np.square(poses - poses.mean(axis=0)).sum(axis=(1, 2)).argmin())
 
     def absolute(self, x: Float[Array, "frames verts 3"]) -> Float[Array, "frames verts 3"]:
         """Return positions measured from the track's origin, in the world, m."""
