@@ -197,16 +197,17 @@ class Swing:
     def offsets(self, params: dict, model: Model, track: MotionFeatures, windows: Windows) -> tuple[Offsets, Kept]:
         """Return offsets of the last frames with a swing, and what they are beyond the static ones.
 
-        The swing is the frame's own, or with motion augmentation any size of another frame's.
+        The swing is the frame's own, or with motion augmentation any size of another frame's, `bounded` as those of animations
+        are: what none of them can show would only cost the garment's shape.
         """
         swing, ends, others = required(track.swing, "track.swing"), windows.ends, windows.ends
         if windows.axis is not None:
             others = lax.all_gather(ends, windows.axis, tiled=True)
         at = jnp.where(windows.own, ends, others[windows.others])
         share = windows.number.astype(swing.dtype) / max(windows.augmented - 1, 1)
-        share = jnp.where(windows.own, 1, share * self.enlargement(track, at))
-        share = jnp.where(windows.number < required(windows.still, "windows.still"), share, 0)
-        q = share[:, None] * swing[at]
+        other = self.bounded(model, (share * self.enlargement(track, at))[None] * swing[at].T)
+        swings = windows.number < required(windows.still, "windows.still")
+        q = jnp.where(swings[:, None], jnp.where(windows.own[:, None], swing[at], other.T), 0)
         codes = Codes(self._static(params, track.static[ends]), self._dynamic(params, q), q)
         z = codes.together()
         offsets = decode(self, params, model, jnp.concatenate([z, lax.stop_gradient(codes.static)]))
