@@ -565,7 +565,9 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     bare, worst = int((deepest > 1).sum()), every * int(deepest.argmax())
     assert bare > 0 and (quick["bare"], quick["barest"], quick["measured"]) == (bare, worst, len(deepest))
     shows = f"skin shows by 1 mm in {bare} of {len(deepest)} frames that were measured"
-    assert f"{shows}, at most {deepest.max():.1f} mm outside the cloth in frame {worst}" in text
+    joint = run.assembly.prepared.weights[int(quick["barest_vertex"])].argmax()
+    place = f"outside the cloth by {run.assembly.body.joint_names[joint]} in frame {worst}"
+    assert f"{shows}, at most {deepest.max():.1f} mm {place}" in text
     page = (out / "preview.html").read_text()
     assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
 
@@ -680,11 +682,28 @@ def test_what_is_read_is_not_written_over(run_folder, capsys, line):
     assert file.read_bytes() == before
 
 
-@pytest.mark.parametrize(("command", "video"), [("animate", ".glb, .mp4, or a folder"), ("simulate", ".glb, or a folder")])
-def test_an_unknown_suffix_is_told_all_that_the_command_writes(run_folder, tmp_path, capsys, command, video):
+@pytest.mark.parametrize(("command", "drawn"), [("animate", ".mp4, .png, "), ("simulate", "")])
+def test_an_unknown_suffix_is_told_all_that_the_command_writes(run_folder, tmp_path, capsys, command, drawn):
     target = str(run_folder[command == "animate"])
     assert main([command, target, "--out", str(tmp_path / "a.abc")]) == 2
-    one_line(capsys, ["a.abc: one of .npz, .h5, .hdf5, .pc2, .mdd, ", video, "found '.abc'"])
+    one_line(capsys, ["a.abc: one of .npz, .h5, .hdf5, .pc2, .mdd, ", f".glb, {drawn}or a folder", "found '.abc'"])
+
+
+def test_animate_draws_the_moments_that_are_asked_for(run_folder, tmp_path, capsys):
+    folder, picture = str(run_folder[1]), tmp_path / "new" / "a.png"
+    sizes = []
+    for more in ([], ["--frames", "3", "23", "--checker"]):
+        assert main(["animate", folder, "--out", str(picture), *more]) == 0
+        with Image.open(picture) as drawn:
+            sizes.append(drawn.size)
+    assert re.findall(r"(\d+) of 24 frames", capsys.readouterr().out) == ["8", "2"]
+    assert sizes[0][0] > 3 * sizes[1][0] > 300
+    assert main(["animate", folder, "--out", str(picture), "--frames", "24"]) == 2
+    one_line(capsys, ["--frames: frames 0 to 23 of the motion expected (found 24)"])
+    assert main(["animate", folder, "--out", str(tmp_path / "a.npz"), "--frames", "2"]) == 2
+    one_line(capsys, ["a.npz: --frames: .png expected"])
+    assert main(["animate", folder, "--out", str(picture), "--body"]) == 2
+    one_line(capsys, ["a.png: --body: .glb expected"])
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.pc2", "a.mdd", "a.usdc", "a.glb", "frames"])

@@ -20,9 +20,16 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands", "animate", "export"]
 
+MOMENTS = 8  # in a picture
+
 
 def add_commands(commands) -> None:
     """Declare the options of both commands."""
+    _add_animate(commands)
+    _add_export(commands)
+
+
+def _add_animate(commands) -> None:
     parser = arguments.command(commands, "animate", animate, "animate a trained garment over a motion")
     parser.add_argument("folder", metavar="RUN", help="folder that ncs train made")
     parser.add_argument(
@@ -47,12 +54,21 @@ def add_commands(commands) -> None:
         help="leave cloth in the body where the network has it there (default: put out)",
     )
     parser.add_argument("--notes", action="store_true", help="print all that was done to bring --motion onto the skeleton")
-    parser.add_argument("--out", required=True, metavar="FILE", help=f"{arguments.FORMATS}; or .mp4, a video")
+    parser.add_argument("--out", required=True, metavar="FILE", help=f"{arguments.FORMATS}; or drawn: .mp4, .png")
     parser.add_argument("--body", action="store_true", help="write the body too, skinned, into a .glb")
     parser.add_argument(
-        "--checker", action="store_true", help="in an .mp4: a pattern of 4 cm on the cloth, for strain and sliding"
+        "--checker", action="store_true", help="where it is drawn: a pattern of 4 cm on the cloth, for strain and sliding"
+    )
+    parser.add_argument(
+        "--frames",
+        type=lambda text: arguments.whole(text, 0),
+        nargs="+",
+        metavar="FRAME",
+        help="in a .png: which moments of the motion, from 0 (default: eight, evenly spread)",
     )
 
+
+def _add_export(commands) -> None:
     parser = arguments.command(
         commands, "export", export, "write one step of a trained garment for a host that has neither JAX nor this package"
     )
@@ -93,8 +109,14 @@ def animate(options) -> int:
     from ncs_jax.io.animation.animation import animation_suffix
 
     # before the run is read
-    suffix = _video_suffix(options) or animation_suffix(options.out, with_body=options.body, also=(".mp4",))
+    drawn = _is_drawn(options)
+    if not drawn:
+        animation_suffix(options.out, with_body=options.body, also=(".mp4", ".png"))
     run, motion = _run_and_motion(options)
+    last = max(options.frames or [0])
+    if last >= len(motion.poses):
+        expected = f"frames 0 to {len(motion.poses) - 1} of the motion expected"
+        raise InputError(expected, field="--frames", value=last, mend="or another --motion")
     worn_by = None
     if options.body:
         if run.assembly.body is None:
@@ -111,9 +133,8 @@ def animate(options) -> int:
         vertices = _refined(run, motion, options.alpha, options.refine, outside)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
-    if suffix == ".mp4":
-        _write_video(run, motion, vertices, options)
-        print(f"{options.out}: {len(vertices)} frames at {fps:g} per second{error}")
+    if drawn:
+        print(f"{_draw(run, motion, vertices, options)}{error}")
         return 0
     names = arguments.mesh_names(run.assembly.scene)
     more = {"rest": garment.vertices, "uv": garment.uv}
@@ -126,33 +147,46 @@ def animate(options) -> int:
     return 0
 
 
-def _video_suffix(options) -> str:
-    """Return .mp4 where a video is asked for and can be made, else nothing."""
-    if Path(options.out).suffix.lower() != ".mp4":
-        if options.checker:
-            raise InputError(
-                "a video expected", file=options.out, field="--checker", mend="end the name in .mp4, or leave it out"
-            )
-        return ""
-    if options.body:
-        raise InputError(".glb expected", file=options.out, field="--body", mend="leave it out: a video shows the body")
-    from ncs_jax.view.video import check_video
+def _is_drawn(options) -> bool:
+    """Tell whether a picture or a video is asked for, and can be made."""
+    suffix = Path(options.out).suffix.lower()
+    drawn = suffix in (".mp4", ".png")
+    for name, possible, expected in (("checker", drawn, ".mp4 or .png"), ("frames", suffix == ".png", ".png")):
+        if getattr(options, name) and not possible:
+            mend = f"end the name in {expected}, or leave it out"
+            raise InputError(f"{expected} expected", file=options.out, field=f"--{name}", mend=mend)
+    if drawn and options.body:
+        raise InputError(".glb expected", file=options.out, field="--body", mend="leave it out: the body is drawn")
+    if suffix == ".mp4":
+        from ncs_jax.view.video import check_video
 
-    check_video(options.out)
-    return ".mp4"
+        check_video(options.out)
+    elif drawn:
+        from ncs_jax.io.tables.files import check_place
+
+        if check_place(options.out).is_dir():
+            raise InputError("a file expected", file=options.out, value="a folder", mend="give another name")
+    return drawn
 
 
-def _write_video(run: Run, motion: MotionRecord, vertices: np.ndarray, options) -> None:
-    """Draw a video of the garment on its body, with a bar."""
+def _draw(run: Run, motion: MotionRecord, vertices: np.ndarray, options) -> str:
+    """Draw the garment on its body: every frame, with a bar, or some moments. Return what has been written."""
     from ncs_jax.cli.progress import WorkProgress
     from ncs_jax.view.character import animation_of
-    from ncs_jax.view.video import animation_mp4
 
     shown = animation_of(run.assembly, motion, vertices)
     if options.checker:
         shown = replace(shown, checker=run.assembly.garment.vertices)
+    if Path(options.out).suffix.lower() == ".png":
+        from ncs_jax.view.pictures import contact_sheet
+
+        contact_sheet(options.out, shown, frames=options.frames or MOMENTS)
+        return f"{options.out}: {len(options.frames or vertices[:MOMENTS])} of {len(vertices)} frames"
+    from ncs_jax.view.video import animation_mp4
+
     with WorkProgress("drawing the video") as progress:
         animation_mp4(options.out, shown, report=lambda share: progress.show("drawing the video", share, 1.0))
+    return f"{options.out}: {len(vertices)} frames at {shown.fps:g} per second"
 
 
 def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int, outside: bool = False) -> np.ndarray:

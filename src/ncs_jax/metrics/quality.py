@@ -248,6 +248,8 @@ def measure_on_host(
 ) -> dict[str, np.ndarray]:
     """Return `strain_mean`, and with a body what `QUANTITIES` says of penetration, of each frame: `measure` compiling nothing.
 
+    With it comes `deepest`, a vertex of what is deepest: itself, or one of its edge or triangle.
+
     Args:
         vertices: (frames, verts, 3), m, such as a few frames of a motion. skin: what the garment may touch, as
             `model.surface` numbers it, in these frames (frames, body, 3), m. middles: of edges and triangles too.
@@ -267,7 +269,8 @@ def measure_on_host(
         if part.size:
             rows[f"{name}penetrating"] = 100 * (part > 0).mean(axis=1)
             rows[f"{name}depth_max"] = 1000 * np.maximum(part.max(axis=1), 0)
-    return rows
+    first = np.concatenate([np.arange(own), edges[:, 0], faces[:, 0]])
+    return rows | {"deepest": first[depths.argmax(axis=1)]}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:

@@ -54,7 +54,7 @@ def preview(
     come first, the measures last, and the page is then written again with them. Strain and penetration are exact, of every
     n-th frame, at most `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what
     `metrics.quality` says of penetration; every, n; measured, frames. Where skin is 1 mm outside: bare, in how many; barest,
-    the worst. Curves need a log and matplotlib.
+    the worst, and a vertex there, barest_vertex. Curves need a log and matplotlib.
 
     Args:
         run: trained.
@@ -158,10 +158,13 @@ def _measured(run: Run, animation: Animation) -> dict[str, float]:
         count = whole.shape[1] - animation.body.worn
         skin = np.concatenate([whole[::every, part], whole[::every, count:]], axis=1)
     rows = measure_on_host(run.assembly.model, animation.garment[::every], skin)
+    deepest = rows.pop("deepest", np.zeros(0))
     found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
     if "depth_max" in rows:
         out = np.max([rows[f"{part}depth_max"] for part in PARTS], axis=0)
-        found |= {"bare": float((out > BARE).sum()), "barest": float(every * out.argmax())} if out.max() > BARE else {}
+        if out.max() > BARE:
+            worst = out.argmax()
+            found |= {"bare": float((out > BARE).sum()), "barest": float(every * worst), "barest_vertex": float(deepest[worst])}
     return found
 
 
