@@ -63,6 +63,22 @@ def test_force_meets_counterforce_and_differences(rng):
     assert (energy(x + h * way) - energy(x - h * way)) / (2 * h) == pytest.approx(np.sum(slope * way), rel=1e-5)
 
 
+def test_each_of_three_feels_those_below_it_and_above(rng):
+    """A wavy sheet, one over it and a third over both, in three poses: as each upper one by itself, and by differences."""
+    x, (second,) = two_sheets(-0.001)
+    x, faces = np.asarray(x), np.concatenate([np.asarray(second.below.faces), second.first + sheet(3, 3, 0.01)[1]])
+    x = np.concatenate([x, x[second.first :] + [0.011, 0.002, 0.002]])
+    third = Upper(surface_from(x[second.stop :], x[: second.stop], faces), second.stop, len(x))
+    x = x[..., None] + 0.001 * rng.normal(size=(*x.shape, 3))
+    energy, *each = (energy_of(uppers) for uppers in ((second, third), (second,), (third,)))
+    parts, slope = [alone(x) for alone in each], np.asarray(jax.jit(jax.grad(lambda x: energy(x).sum()))(x))
+    assert np.min(parts) > 0
+    np.testing.assert_allclose(energy(x), sum(parts), rtol=1e-9)
+    way, h = rng.normal(size=x.shape), 1e-7
+    found = (energy(x + h * way) - energy(x - h * way)) / (2 * h)
+    np.testing.assert_allclose(found, np.sum(slope * way, axis=(0, 1)), rtol=1e-5)
+
+
 def test_cloth_beyond_a_rim_touches_nothing():
     """Half of the upper sheet hangs past the edge of the lower one, and below its plane."""
     x, uppers = two_sheets(-0.003, (0.09, 0.0))

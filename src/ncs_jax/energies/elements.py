@@ -19,7 +19,7 @@ from ncs_jax.energies.membrane import per_face
 from ncs_jax.energies.terms import DENSITIES, Garment, Material, StepInputs, Terms
 from ncs_jax.energies.total import energy_terms
 from ncs_jax.errors import required
-from ncs_jax.geometry.mesh import corners
+from ncs_jax.geometry.mesh import corners, gathered
 from ncs_jax.geometry.soa_vectors import plus
 
 __all__ = ["elastic", "energies_and_gradient"]
@@ -136,7 +136,7 @@ def elastic(
             else:
                 energy, pull = jax.vjp(lambda edge: per_edge(edge, mesh, *material.membrane), corners(x, mesh.edges))
                 (on_edges,) = pull(jnp.ones_like(energy))
-                gradient = _gathered(on_edges, required(mesh.rings, "mesh.rings").edges)
+                gradient = gathered(on_edges, required(mesh.rings, "mesh.rings").edges)
             parts["membrane"] = jnp.sum(energy, axis=0)
     if terms.bending:
         with jax.named_scope("bending"):
@@ -144,13 +144,5 @@ def elastic(
             on_faces = [plus(a, b) for a, b in zip(on_faces, folds, strict=True)]
             parts["bending"] = jnp.sum(energy, axis=0)
     if face:
-        gradient = gradient + _gathered(on_faces, required(mesh.rings, "mesh.rings").faces)
+        gradient = gradient + gathered(on_faces, required(mesh.rings, "mesh.rings").faces)
     return parts, gradient
-
-
-def _gathered(forces, ring):
-    """Sum at every vertex (verts, 3, *poses) of the forces on the corners around it."""
-    forces = jnp.stack([jnp.stack(corner, axis=1) for corner in forces])
-    forces = forces.reshape(-1, *forces.shape[2:])
-    start = jnp.zeros((len(ring), *forces.shape[1:]), forces.dtype)
-    return sum((jnp.take(forces, at, axis=0, mode="fill", fill_value=0) for at in ring.T), start=start)

@@ -21,6 +21,7 @@ __all__ = [
     "corners",
     "dihedral",
     "edge_strain",
+    "gathered",
     "material_axes",
     "mesh_from",
     "relative_heights",
@@ -80,6 +81,14 @@ class Mesh:
 def corners(x: Float[Array, "verts 3 *poses"], elements: Int[Array, "elements corners"]) -> list[Vector]:
     """Return the positions of every element's first corner, second corner and so on, by component (elements, *poses)."""
     return [[p[:, i] for i in range(3)] for p in (x[elements[:, k]] for k in range(elements.shape[1]))]
+
+
+def gathered(told: Sequence[Vector], ring: Int[Array, "verts most"]) -> Float[Array, "verts 3 *poses"]:
+    """Return the sum at every vertex of what elements tell their corners, as `corners` has them; ring: as those of `Rings`."""
+    rows = jnp.stack([jnp.stack(corner, axis=1) for corner in told])
+    rows = rows.reshape(-1, *rows.shape[2:])
+    start = jnp.zeros((len(ring), *rows.shape[1:]), rows.dtype)
+    return sum((jnp.take(rows, at, axis=0, mode="fill", fill_value=0) for at in ring.T), start=start)
 
 
 def spread(constant: Float[Array, "elements"], like: Float[Array, "elements *poses"]) -> Float[Array, "elements ..."]:

@@ -16,7 +16,7 @@ from ncs_jax.energies.contact.collision import collision
 from ncs_jax.energies.contact.distance import nearest_distance, plane_distance, triangle_distance
 from ncs_jax.energies.contact.nearest import nearest_triangle
 from ncs_jax.energies.contact.points import on_vertices, with_points
-from ncs_jax.energies.contact.surface import Surface, face_normals, vertex_normals
+from ncs_jax.energies.contact.surface import Surface, face_normals, moving_normals
 from ncs_jax.geometry.closest_point import closest_weights, gap_to
 
 __all__ = ["Upper", "layer_blocks", "layer_distances", "layer_product", "layers", "rim_ways"]
@@ -32,14 +32,28 @@ class Upper:
     stop: int = field(metadata={"static": True})
 
 
-def _by_planes(x: Float[Array, "verts 3 *poses"], upper: Upper) -> Float[Array, "points *poses"]:
+class _Planes(NamedTuple):
+    """Normals at all vertices that lie below some garment, and the ways out at rims there, see `rim_ways`."""
+
+    normals: Float[Array, "below 3 *poses"]
+    ways: Float[Array, "below 3 *poses"]
+
+
+def _planes(x: Float[Array, "verts 3 *poses"], uppers: tuple[Upper, ...]) -> _Planes:
+    """Return them of what is below the outermost, which is what is below each and more; XLA would make them for each point."""
+    lower, surface = x[: uppers[-1].first], uppers[-1].below
+    made = _Planes(moving_normals(lower, surface), rim_ways(lax.stop_gradient(lower), surface))
+    return lax.optimization_barrier(made)
+
+
+def _by_planes(x: Float[Array, "verts 3 *poses"], upper: Upper, planes: _Planes) -> Float[Array, "points *poses"]:
     """Return distances from the plane of the nearest vertex below, m; cloth that hangs beyond a rim touches nothing."""
     lower, own, surface = x[: upper.first], x[upper.first : upper.stop], upper.below
     if surface.points is not None:
         own = lax.optimization_barrier(with_points(own, surface.points))
     index = touched(own, lower, surface)
-    distance = plane_distance(own, lower, vertex_normals(lower, surface), index)
-    beyond = lax.stop_gradient(plane_distance(own, lower, rim_ways(lower, surface), index)) > 0
+    distance = plane_distance(own, lower, planes.normals[: upper.first], index)
+    beyond = lax.stop_gradient(plane_distance(own, lower, planes.ways[: upper.first], index)) > 0
     return jnp.where(surface.border[index] & beyond, jnp.inf, distance)
 
 
@@ -68,10 +82,10 @@ def layers(
     p are the vertices of u and, where contact looks between them, its points there. What lies below moves too: n and c are
     differentiated, so that to each force there is one against it.
     """
-    energy = jnp.zeros(x.shape[2:], x.dtype)
+    energy, below = jnp.zeros(x.shape[2:], x.dtype), _planes(x, uppers) if planes and uppers else None
     for upper in uppers:
-        if planes:
-            energy += collision(_by_planes(x, upper), thickness, stiffness)
+        if below is not None:
+            energy += collision(_by_planes(x, upper, below), thickness, stiffness)
         else:
             touch = _by_triangles(*_both(x, upper), upper.below, thickness)
             energy += stiffness * jnp.sum(touch.share * jnp.minimum(touch.distance - thickness, 0) ** 2)

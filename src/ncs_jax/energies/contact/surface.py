@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ncs_jax.energies.contact.halfway import Halfway, halfway_from
 from ncs_jax.energies.contact.points import ContactPoints, with_points
-from ncs_jax.geometry.mesh import corners, topology, vertex_rings
+from ncs_jax.geometry.mesh import corners, gathered, topology, vertex_rings
 from ncs_jax.geometry.numerics import normalize
-from ncs_jax.geometry.soa_vectors import cross, direction, minus
+from ncs_jax.geometry.soa_vectors import cross, direction, minus, plus
 
-__all__ = ["Surface", "compact_groups", "face_normals", "rebuild_lists", "surface_from", "vertex_normals"]
+__all__ = ["Surface", "compact_groups", "face_normals", "moving_normals", "rebuild_lists", "surface_from", "vertex_normals"]
 
 
 @jax.tree_util.register_dataclass
@@ -161,8 +161,41 @@ def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> 
 
 def vertex_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
     """Return area-weighted unit normals of the body's vertices."""
-    a, b, c = corners(body, surface.faces)
-    area = jnp.stack(cross(minus(b, a), minus(c, a)), axis=1)
-    around = [jnp.take(area, at, axis=0, mode="fill", fill_value=0) for at in surface.rings.T]
-    total = sum(around, start=jnp.zeros_like(body))
+    return _unit(_areas(body, surface.faces, surface.rings))
+
+
+def moving_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
+    """Return the same of a body that is differentiated: backward alone, by sums over neighbours that scatter nothing."""
+    return _unit(_moving_areas(body, surface.faces, surface.rings))
+
+
+def _unit(total):
     return jnp.stack(direction([total[:, i] for i in range(3)]), axis=1)
+
+
+def _areas(body, faces, rings):
+    """Twice the sum of the area vectors around each vertex."""
+    a, b, c = corners(body, faces)
+    area = jnp.stack(cross(minus(b, a), minus(c, a)), axis=1)
+    around = [jnp.take(area, at, axis=0, mode="fill", fill_value=0) for at in rings.T]
+    return sum(around, start=jnp.zeros_like(body))
+
+
+_moving_areas = jax.custom_vjp(_areas)
+
+
+def _areas_backward(saved, toward):
+    """What the area vectors toward g tell each corner: sum of g over the triangle x the edge opposite to the corner."""
+    body, faces, rings = saved
+    a, b, c = corners(body, faces)
+    ga, gb, gc = corners(toward, faces)
+    g = plus(plus(ga, gb), gc)
+    told = [cross(g, minus(c, b)), cross(g, minus(a, c)), cross(g, minus(b, a))]
+    here = jnp.arange(len(body), dtype=faces.dtype)[:, None, None]
+    place = (
+        jnp.argmax(faces.at[rings].get(mode="fill", fill_value=-1) == here, axis=-1).astype(faces.dtype) * len(faces) + rings
+    )
+    return gathered(told, jnp.where(rings < len(faces), place, 3 * len(faces))), None, None
+
+
+_moving_areas.defvjp(lambda *given: (_areas(*given), given), _areas_backward)
