@@ -315,6 +315,22 @@ def test_the_command_writes_a_file_to_train_with(tmp_path, capsys):
     assert "gone.obj" in capsys.readouterr().err
 
 
+def test_a_scene_that_is_there_is_kept_and_what_differs_in_it_is_said(tmp_path, capsys):
+    np.savez(tmp_path / "body.npz", **post())
+    trimesh.Trimesh(sleeve(0.075).vertices, sleeve().faces, process=False).export(tmp_path / "g.obj")
+    command = ["fit", str(tmp_path / "g.obj"), "--body", str(tmp_path / "body.npz"), "--stay", "--out", str(tmp_path / "x.npz")]
+    scene, told = tmp_path / "x.toml", []
+    for text, more in (("", []), ("\n# my note\n", []), ("", ["--pins", "none"]), ("\nbroken", [])):
+        if scene.exists():
+            scene.write_text(text := scene.read_text() + text)
+        assert main([*command, *more]) == 0
+        told.append(capsys.readouterr().out.split("kept ")[-1].splitlines())
+        assert not text or scene.read_text() == text
+    assert told[0][-1].startswith("next:") and told[1] == [f"{scene}, which is there, and says the same"]
+    assert told[2][1].split() == ["garment.pins", '"pins",', "found", "now:", "nothing", "to", "say"] and len(told[2]) == 3
+    assert "A scene for this garment" in told[3][0] and "[garment]" in told[3]
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.001])
 def test_vertices_are_welded_in_metres_whatever_the_unit_that_is_found(tmp_path, capsys, scale):
     """Single precision splits them: each triangle has its own, off by what a float of a thousand millimetres is."""

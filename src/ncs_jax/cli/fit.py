@@ -24,6 +24,7 @@ MOTIONS = (
     *("stand", "walk", "walk_turn_stop", "jump", "twist", "lift_arms", "dance"),
     *(f"cmu_{name}" for name in ("walk", "walk_fast", "run", "dance", "spin", "turn", "ball", "stand")),
 )
+FOUND = ("body.", "garment.", "physics.collision.", "physics.bending.")  # what fitting finds out, in a scene
 HOLES = 10  # so many small ones are listed
 LIMBS = {"left arm", "right arm", "left thigh", "right thigh"}  # whose joints the packaged motions must find
 
@@ -128,7 +129,7 @@ def fit(options) -> int:
     print(f"wrote {out} and {picture}")
     file = out.with_suffix(".toml")
     if file.exists():
-        print(f"kept {file}, which is there. A scene for this garment:\n\n{text}", end="")
+        _say_kept(file, text)
     else:
         file.write_text(text)
         name, run = shlex.quote(str(file)), shlex.quote(f"runs/{out.stem}")
@@ -138,6 +139,33 @@ def fit(options) -> int:
         first = "name its motions there, then " if "files = []" in text else ""
         print(f"wrote {file}, a scene to {use}:\n\n{text}\nnext: {first}ncs check {name}, then {after}")
     return 0
+
+
+def _say_kept(file: Path, text: str) -> None:
+    """Print that a scene file is left as it is, and where it differs from the scene that would have been written."""
+    import tomllib
+
+    try:
+        there, here = (_values(tomllib.loads(scene)) for scene in (file.read_text(), text))
+    except (OSError, ValueError):  # not to be read: the scene stands below it
+        print(f"kept {file}, which is there. A scene for this garment:\n\n{text}", end="")
+        return
+    about = [key for key in {**here, **there} if key.startswith(FOUND) and here.get(key) != there.get(key)]
+    print(f"kept {file}, which is there{', and says the same' if not about else '. Of what was found it differs in:'}")
+    for key in about:
+        print(f"  {key:29} {there.get(key, 'unsaid')}, found now: {here.get(key, 'nothing to say')}")
+    if about:
+        print("mend: change these there, or delete it and fit again")
+
+
+def _values(tables: dict, above: str = "") -> dict[str, str]:
+    """Return the values of nested tables as a file says them, by `table.field`."""
+    found: dict[str, str] = {}
+    for key, value in tables.items():
+        found |= (
+            _values(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": json.dumps(value, default=str)}
+        )
+    return found
 
 
 def _placed(options, body, scale: float):
