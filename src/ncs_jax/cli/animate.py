@@ -113,10 +113,6 @@ def animate(options) -> int:
     if not drawn:
         animation_suffix(options.out, with_body=options.body, also=(".mp4", ".png"))
     run, motion = _run_and_motion(options)
-    last = max(options.frames or [0])
-    if last >= len(motion.poses):
-        expected = f"frames 0 to {len(motion.poses) - 1} of the motion expected"
-        raise InputError(expected, field="--frames", value=last, mend="or another --motion")
     worn_by = None
     if options.body:
         if run.assembly.body is None:
@@ -218,6 +214,10 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
         raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
     records = {name: run.motion(name) for name in motions}
     run = replace(run, assembly=replace(run.assembly, motions=records))
+    last, count = max(options.frames or [0]), len(records[motions[0]].poses)
+    if last >= count:
+        expected = f"frames 0 to {count - 1} of the motion expected"
+        raise InputError(expected, field="--frames", value=last, mend="or another --motion")
     if options.motion:
         _tell_motions(run.assembly, options.notes)
     if options.adapt is not None:
