@@ -162,9 +162,8 @@ def _values(tables: dict, above: str = "") -> dict[str, str]:
     """Return the values of nested tables as a file says them, by `table.field`."""
     found: dict[str, str] = {}
     for key, value in tables.items():
-        found |= (
-            _values(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": json.dumps(value, default=str)}
-        )
+        name = f"{above}{key}"
+        found |= _values(value, f"{name}.") if isinstance(value, dict) else {name: json.dumps(value, default=str)}
     return found
 
 

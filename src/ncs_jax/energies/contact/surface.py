@@ -191,11 +191,9 @@ def _areas_backward(saved, toward):
     ga, gb, gc = corners(toward, faces)
     g = plus(plus(ga, gb), gc)
     told = [cross(g, minus(c, b)), cross(g, minus(a, c)), cross(g, minus(b, a))]
-    here = jnp.arange(len(body), dtype=faces.dtype)[:, None, None]
-    place = (
-        jnp.argmax(faces.at[rings].get(mode="fill", fill_value=-1) == here, axis=-1).astype(faces.dtype) * len(faces) + rings
-    )
-    return gathered(told, jnp.where(rings < len(faces), place, 3 * len(faces))), None, None
+    around = faces.at[rings].get(mode="fill", fill_value=-1)
+    corner = jnp.argmax(around == jnp.arange(len(body), dtype=faces.dtype)[:, None, None], axis=-1).astype(faces.dtype)
+    return gathered(told, jnp.where(rings < len(faces), corner * len(faces) + rings, 3 * len(faces))), None, None
 
 
 _moving_areas.defvjp(lambda *given: (_areas(*given), given), _areas_backward)
