@@ -27,6 +27,7 @@ from ncs_jax.cli.train import _TrainingBar
 from ncs_jax.errors import InputError
 from ncs_jax.io import MotionRecord
 from ncs_jax.metrics.quality import measure
+from ncs_jax.metrics.seen import SkinShown
 from ncs_jax.prepare.joint_names import listed
 from ncs_jax.prepare.scene_checks import Risk
 from ncs_jax.runs.run import load_run
@@ -542,7 +543,11 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
     monkeypatch.setattr("ncs_jax.view.preview.MEASURED", 8)
     # what is put outside of the post is so in all frames
-    monkeypatch.setattr("ncs_jax.runs.outside.pushing", lambda model: np.zeros(len(model.surface.rings), np.float32))
+    monkeypatch.setattr("ncs_jax.runs.outside.pushing", lambda model: None)
+    # nothing of this post is covered so that it could show
+    monkeypatch.setattr(
+        "ncs_jax.view.preview.shown_skin", lambda model, x, body, frames: SkinShown(len(x), 3, frames[2], 40, 1)
+    )
     out = tmp_path / "drawn"
     assert main(["preview", str(folder), "--out", f"{out}.png"]) == 2 and not Path(f"{out}.png").exists()
     assert "a folder expected" in capsys.readouterr().err
@@ -562,15 +567,16 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     np.testing.assert_allclose(quick["strain_mean"], rows["strain_mean"][::every].mean(), rtol=1e-3)
     np.testing.assert_allclose(quick["penetrating"], rows["penetrating"][::every].mean(), atol=1e-6)
     np.testing.assert_allclose(quick["depth_max"], rows["depth_max"][::every].max(), atol=1e-2)
-    deepest = np.max([rows[f"{part}depth_max"] for part in ("", "middle_", "centre_")], axis=0)[::every]
-    bare, worst = int((deepest > 1).sum()), every * int(deepest.argmax())
-    assert bare > 0 and (quick["bare"], quick["barest"], quick["measured"]) == (bare, worst, len(deepest))
-    shows = f"skin shows by 1 mm in {bare} of {len(deepest)} frames that were measured"
-    assert f"{shows}, at most {deepest.max():.1f} mm outside the cloth in frame {worst}" in text
+    looked = len(rows["penetrating"][::every])
+    assert (quick["skin_looked"], quick["skin_shown"], quick["skin_frame"], quick["skin_pixels"]) == (looked, 3, 2 * every, 40)
+    told = f"skin shows in 3 of {looked} frames that were looked at, most in frame 6: 40 pixels of six views"
+    assert told in " ".join(text.split())
     names = tuple(f"joint_{j}" for j in range(len(run.assembly.body.parents)))
-    preview._say_bare(quick, replace(run.assembly, body=replace(run.assembly.body, joint_names=names)))
-    joint = run.assembly.prepared.weights[int(quick["barest_vertex"])].argmax()
-    assert f"outside the cloth by joint_{joint} in frame {worst}" in capsys.readouterr().out
+    check.tell_skin(SkinShown(9, 1, 4, 30, 1), replace(run.assembly, body=replace(run.assembly.body, joint_names=names)))
+    joint = run.assembly.body.weights[run.assembly.prepared.part[1]].argmax()
+    assert f"most in frame 4 by joint_{joint}: 30 pixels" in capsys.readouterr().out
+    check.tell_skin(SkinShown(9, 0, 4, 10, 1), run.assembly)
+    assert not capsys.readouterr().out
     page = (out / "preview.html").read_text()
     assert "mean strain" in page and "10 steps on" in page and {p.name for p in out.iterdir()} == set(written)
 
@@ -889,6 +895,28 @@ def test_animate_a_motion_from_the_current_folder(run_folder, tmp_path, capsys, 
     one_line(capsys, ["other.npz: frames", "(2, 30)"])
     assert main(["animate", str(folder), "--out", "d.gif"]) == 2
     one_line(capsys, ["d.gif", ".npz"])
+
+
+def test_animate_tells_where_skin_shows(run_folder, tmp_path, capsys, monkeypatch):
+    """Of what is written, in frames evenly spread and the one that is most beyond the training."""
+    _, folder = run_folder
+    looked = []
+
+    def shown(model, x, body, frames):
+        looked.append((x, body, frames))
+        return SkinShown(len(x), 1, frames[-1], 25, 0)
+
+    monkeypatch.setattr("ncs_jax.metrics.seen.LOOKED_AT", 3)
+    monkeypatch.setattr("ncs_jax.metrics.seen.shown_skin", shown)
+    monkeypatch.setattr("ncs_jax.metrics.coverage.Coverage.worst", (7, "joint", "pose"))
+    np.savez(tmp_path / "other.npz", **swing(frames=9))
+    out = tmp_path / "c.npz"
+    assert main(["animate", str(folder), "--motion", str(tmp_path / "other.npz"), "--out", str(out)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "skin shows in 1 of 4 frames that were looked at, most in frame 7: 25 pixels of six views" in said
+    ((x, body, frames),) = looked
+    assert list(frames) == [0, 3, 6, 7] and body.shape[1] == load_run(folder).assembly.model.body.shape[0]
+    np.testing.assert_allclose(x, np.load(out)["vertices"][frames], atol=1e-6)
 
 
 @pytest.mark.parametrize("whole", [False, True])

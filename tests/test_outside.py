@@ -43,7 +43,7 @@ def around(depths, rng):
 
 
 def test_what_is_a_little_inside_comes_to_the_margin_and_the_rest_stays(rng):
-    depths = np.concatenate([np.linspace(-0.003, 0.015, 40), np.linspace(-0.05, -0.006, 40), np.linspace(0.05, 0.15, 40)])
+    depths = np.concatenate([np.linspace(-0.003, 0.015, 40), np.linspace(-0.05, -0.006, 40), np.linspace(0.09, 0.15, 40)])
     way, cloth = around(depths, rng)
     found, _ = put(cloth, bodies=3)
     assert np.array_equal(found[..., 0], found[..., 2])

@@ -12,7 +12,7 @@ from ncs_jax.geometry.depth_buffer import fragments, rasterise
 from ncs_jax.geometry.mesh import mesh_from
 from ncs_jax.geometry.triangle_crossings import crossed
 from ncs_jax.metrics.quality import summarise
-from ncs_jax.metrics.seen import EVERY, measure_seen
+from ncs_jax.metrics.seen import EVERY, VISIBLE, measure_seen, shown_skin, touchable_bodies
 from ncs_jax.metrics.skin import covered_skin, skin_pixels
 
 from .scenes import post
@@ -109,7 +109,7 @@ def test_a_ball_shows_through_its_cover_where_it_is_outside():
     skin = covered_skin(body, faces, cover, cloth)
     assert skin.covered.all()
     shown, seen = skin_pixels(skin, body, cover)
-    assert shown == 0 and seen * skin.pixel**2 == pytest.approx(6 * np.pi * 0.105**2, rel=0.01)
+    assert not len(shown) and seen * skin.pixel**2 == pytest.approx(6 * np.pi * 0.105**2, rel=0.01)
     d = 0.02
     plane = (0.1**2 - 0.105**2 + d**2) / (2 * d)
     u, z = np.meshgrid(np.linspace(-0.1, 0.1, 801), np.linspace(-0.1, plane, 801))
@@ -119,7 +119,7 @@ def test_a_ball_shows_through_its_cover_where_it_is_outside():
     for turned in (cloth, cloth[:, ::-1]):  # nobody says which side of a garment is its outside
         skin = covered_skin(body, faces, cover, turned)
         shown, _ = skin_pixels(skin, body, cover + [0, 0, d])
-        assert shown * skin.pixel**2 == pytest.approx(expected, rel=0.02)
+        assert len(shown) * skin.pixel**2 == pytest.approx(expected, rel=0.02)
 
 
 def test_what_is_covered_ends_at_the_openings():
@@ -138,11 +138,11 @@ def test_legs_seen_from_below_and_through_a_neck_do_not_count(flare):
     skin = covered_skin(body, faces, x, cloth)
     for moved in (0.0, 0.035):  # without touching: 4 cm are free
         shown, seen = skin_pixels(skin, body + [moved, 0, 0], x)
-        assert shown == 0 and seen > 10_000
-    lifted = skin_pixels(skin, body + [0, 0.3, 0], x)  # covered skin comes out at the top, and is seen
-    assert lifted[0] == 0
-    through = skin_pixels(skin, body + [0.08, 0, 0], x)
-    assert through[0] > 500
+        assert not len(shown) and seen > 10_000
+    lifted, _ = skin_pixels(skin, body + [0, 0.3, 0], x)  # covered skin comes out at the top, and is seen
+    assert not len(lifted)
+    through, _ = skin_pixels(skin, body + [0.08, 0, 0], x)
+    assert len(through) > 500 and body[faces[through], 0].min(axis=1).mean() > 0.02  # on the side to which it is moved
 
 
 def test_an_arm_pressed_into_the_garment_does_not_count():
@@ -154,7 +154,7 @@ def test_an_arm_pressed_into_the_garment_does_not_count():
     assert not skin.covered[len(trunk[1]) :].any() and skin.covered[: len(trunk[1])].any()
     pressed = body - np.where(np.arange(len(body)) < len(trunk[0]), 0, 0.14)[:, None] * [1, 0, 0]
     assert crossed(x, cloth, pressed, faces).any()
-    assert skin_pixels(skin, pressed, x)[0] == 0
+    assert not len(skin_pixels(skin, pressed, x)[0])
 
 
 def test_a_bump_counts_by_its_size():
@@ -162,12 +162,12 @@ def test_a_bump_counts_by_its_size():
     body, faces = leg()
     x, cloth = skirt(0.09)
     skin = covered_skin(body, faces, x, cloth)
-    assert skin_pixels(skin, body, x)[0] == 0
+    assert not len(skin_pixels(skin, body, x)[0])
     dented = x.copy()
     patch = (np.abs(x[:, 1] - 0.55) < 0.03) & (x[:, 2] > 0.08)
     dented[patch] *= np.array([0.07 / 0.09, 1, 0.07 / 0.09])
     shown, _ = skin_pixels(skin, body, dented)
-    area = shown * skin.pixel**2
+    area = len(shown) * skin.pixel**2
     assert 0.03 * 0.05 < area < 2.5 * 0.1 * 0.08
 
 
@@ -195,6 +195,25 @@ def test_frames_of_a_scene(assembly):
     assert 0.2 < found["skin_share"][2] / 100 < 0.099 / 0.24 + 0.01
     assert summarise(found)["body_intersecting"] == pytest.approx(found["body_intersecting"].mean())
     assert len(measure_seen(model, x, still(model, 17), 1)["skin_share"]) == 17
+
+
+def test_where_skin_shows_most_is_told(assembly):
+    """The sheet comes into the post by degrees; half of the frames are looked at."""
+    model = assembly.model
+    x = np.repeat(np.asarray(model.garment.mesh.rest)[None], 12, axis=0)
+    x[4:, :, 2] -= np.linspace(0.01, 0.03, 8)[:, None]
+    track, frames = still(model, 12), np.arange(0, 12, 2)
+    body = touchable_bodies(model, track, frames)
+    found = shown_skin(model, x[frames], body, frames)
+    pixels = measure_seen(model, x, track, 2)["skin_pixels"]
+    assert pixels.max() > VISIBLE > pixels[0] == 0
+    assert (found.looked, found.shown, found.frame, found.pixels) == (
+        6, (pixels >= VISIBLE).sum(), 2 * pixels.argmax(), pixels.max(),
+    )  # fmt: skip
+    covered = np.ptp(x[0], axis=0).max()
+    assert np.linalg.norm(body[0][found.vertex] - x[found.frame], axis=1).min() < covered
+    clean = shown_skin(model, x[:3], body[:3], np.arange(3))
+    assert (clean.shown, clean.pixels, clean.vertex) == (0, 0, 0)
 
 
 def test_without_a_body_only_the_cloth_is_asked(tmp_path):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ncs_jax.io import MotionRecord
+    from ncs_jax.metrics.coverage import Coverage
     from ncs_jax.prepare.build import Assembly
     from ncs_jax.runs.run import Run
 
@@ -112,7 +113,7 @@ def animate(options) -> int:
     drawn = _is_drawn(options)
     if not drawn:
         animation_suffix(options.out, with_body=options.body, also=(".mp4", ".png"))
-    run, motion = _run_and_motion(options)
+    run, motion, known = _run_and_motion(options)
     worn_by = None
     if options.body:
         if run.assembly.body is None:
@@ -127,6 +128,7 @@ def animate(options) -> int:
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     if options.refine:
         vertices = _refined(run, motion, options.alpha, options.refine, outside)
+    _tell_skin(run, motion, vertices, known)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
     if drawn:
@@ -199,8 +201,25 @@ def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int, outs
         )
 
 
-def _run_and_motion(options) -> tuple[Run, MotionRecord]:
-    """Return the run to animate, adapted if that is asked for, and the first of its motions, read once."""
+def _tell_skin(run: Run, motion: MotionRecord, vertices: np.ndarray, known: Coverage | None) -> None:
+    """Print where skin shows in the animation, of frames evenly spread and the one that is most beyond the training."""
+    model = run.assembly.model
+    if model.surface is None:
+        return
+    import numpy as np
+
+    from ncs_jax.cli.check import tell_skin
+    from ncs_jax.metrics.seen import LOOKED_AT, shown_skin, touchable_bodies
+
+    track = run.track(motion)
+    worst = () if known is None else (known.worst[0],)
+    chosen = np.unique([*range(0, len(vertices), -(-len(vertices) // LOOKED_AT)), *worst])
+    body = touchable_bodies(model, track, chosen)
+    tell_skin(shown_skin(model, track.relative(vertices)[chosen], body, chosen), run.assembly)
+
+
+def _run_and_motion(options) -> tuple[Run, MotionRecord, Coverage | None]:
+    """Return the run to animate, adapted if that is asked for, the first of its motions, and how far it is beyond."""
     from ncs_jax.cli.check import tell_beyond
     from ncs_jax.runs.run import load_run
 
@@ -222,8 +241,9 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord]:
         _tell_motions(run.assembly, options.notes)
     if options.adapt is not None:
         run = adapted(run, motions, options).run
-    tell_beyond(run.coverage(records[motions[0]]))
-    return run, records[motions[0]]
+    known = run.coverage(records[motions[0]])
+    tell_beyond(known)
+    return run, records[motions[0]], known
 
 
 def _tell_motions(assembly: Assembly, whole: bool) -> None:

@@ -16,10 +16,12 @@ from ncs_jax.scene.spec import load_scene, template
 if TYPE_CHECKING:
     from ncs_jax.io import MotionRecord
     from ncs_jax.metrics.coverage import Coverage
+    from ncs_jax.metrics.seen import SkinShown
+    from ncs_jax.prepare.build import Assembly
     from ncs_jax.prepare.scene_checks import Risk
     from ncs_jax.prepare.setting import Setting
 
-__all__ = ["add_commands", "check", "tell", "tell_beyond", "tell_risk"]
+__all__ = ["add_commands", "check", "tell", "tell_beyond", "tell_risk", "tell_skin"]
 
 DRAWN = 4  # motions in the picture, at most
 NAMED = 6  # motions of a group that are named, at most
@@ -113,6 +115,19 @@ def tell_beyond(found: Coverage | None) -> None:
     """Print that a motion is beyond what a run was trained on, where it is."""
     if found is not None and found.told:
         tell("beyond", str(found))
+
+
+def tell_skin(found: SkinShown, assembly: Assembly) -> None:
+    """Print in how many frames skin shows, where most, and what mends it, if it does."""
+    if not found.shown:
+        return
+    body, part, thickness = assembly.body, assembly.prepared.part, assembly.scene.physics.collision.thickness
+    place = " by the garment below" if found.vertex >= len(part) else ""
+    if body is not None and body.joint_names and not place:
+        place = f" by {body.joint_names[int(body.weights[part[found.vertex]].argmax())]}"
+    frames = f"in {found.shown} of {found.looked} frames that were looked at, most in frame {found.frame}{place}"
+    mend = f"--adapt 20 of ncs animate, more training, or physics.collision.thickness above {1000 * thickness:g} mm"
+    tell("skin", f"shows {frames}: {found.pixels} pixels of six views; see ncs animate --frames {found.frame}; {mend}")
 
 
 def tell(label: str, text: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ncs_jax.cli import arguments
+from ncs_jax.cli.check import tell_skin
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.errors import InputError
 from ncs_jax.scene.motion_names import split_frames
@@ -51,6 +52,7 @@ def check_video(out: str | Path) -> None:
 
 def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = None, video: bool = False) -> dict[str, float]:
     """Draw a run into a folder; print each file as soon as it is there, and last how it does on the motion."""
+    from ncs_jax.metrics.seen import SkinShown
     from ncs_jax.view.preview import preview
 
     with WorkProgress("drawing the preview") as progress:
@@ -67,27 +69,13 @@ def draw(run, out: str | Path, motion: str | None = None, *, log: Path | None = 
     inside = f", penetrating vertices {quantities['penetrating']:.2f} %" if "penetrating" in quantities else ""
     never += f", one frame in {quantities['every']:.0f}" if quantities["every"] > 1 else ""
     print(f"On {name}{never}:\n  mean strain {quantities['strain_mean']:.2f} %{inside}")
-    _say_bare(quantities, run.assembly)
+    if "skin_shown" in quantities:
+        shown = SkinShown(**{name.removeprefix("skin_"): int(n) for name, n in quantities.items() if name.startswith("skin_")})
+        tell_skin(shown, run.assembly)
     others = len({*scene.motion.validation, *scene.motion.files}) - 1
     if motion is None and others:
         print(f"  nothing of its {others} other motions: ncs preview RUN --motion FILE draws and measures another")
     return quantities
-
-
-def _say_bare(quantities: dict[str, float], assembly) -> None:
-    """Print in how many frames skin is outside the cloth, where it is worst, and what mends it."""
-    if "bare" not in quantities:
-        return
-    body, thickness = assembly.body, assembly.scene.physics.collision.thickness
-    joint = int(assembly.prepared.weights[int(quantities["barest_vertex"])].argmax())
-    place = f" by {body.joint_names[joint]}" if body is not None and body.joint_names else ""
-    deepest = max(quantities[f"{part}depth_max"] for part in ("", "middle_", "centre_"))
-    frames = f"{quantities['bare']:.0f} of {quantities['measured']:.0f} frames that were measured"
-    worst = f"{deepest:.1f} mm outside the cloth{place} in frame {quantities['barest']:.0f}"
-    print(f"  skin shows by 1 mm in {frames}, at most {worst} (see ncs animate --frames): train longer (--resume),")
-    print(
-        f"  on motions like it (--adapt 20 of ncs animate), or with physics.collision.thickness above {1000 * thickness:g} mm"
-    )
 
 
 def _is_trained_on(files: Sequence[str], name: str) -> bool:

@@ -243,34 +243,23 @@ def measure(
     return {name: np.concatenate([rows[name] for rows in blocks])[:count] for name in blocks[0]}
 
 
-def measure_on_host(
-    model: Model, vertices: np.ndarray, skin: np.ndarray | None = None, *, middles: bool = True
-) -> dict[str, np.ndarray]:
-    """Return `strain_mean`, and with a body what `QUANTITIES` says of penetration, of each frame: `measure` compiling nothing.
-
-    With it comes `deepest`, a vertex of what is deepest: itself, or one of its edge or triangle.
+def measure_on_host(model: Model, vertices: np.ndarray, skin: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Return `strain_mean`, and with a body what is inside of it, of each frame, as `measure` does; it compiles nothing.
 
     Args:
         vertices: (frames, verts, 3), m, such as a few frames of a motion. skin: what the garment may touch, as
-            `model.surface` numbers it, in these frames (frames, body, 3), m. middles: of edges and triangles too.
+            `model.surface` numbers it, in these frames (frames, body, 3), m.
     """
     mesh = model.garment.mesh
-    edges, faces, rest = np.asarray(mesh.edges), np.asarray(mesh.faces), np.asarray(mesh.edge_length, np.float64)
+    edges, rest = np.asarray(mesh.edges), np.asarray(mesh.edge_length, np.float64)
     x = np.asarray(vertices, np.float64)
     lengths = np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2)
     rows = {"strain_mean": 100 * np.abs(lengths / np.where(rest > 0, rest, 1) - 1).mean(axis=1)}
     if skin is None or model.surface is None:
         return rows
-    points = np.stack([with_middles(frame, edges, faces) for frame in x]) if middles else x
-    depths = depths_on_host(points, skin, np.asarray(model.surface.faces), layered=bool(model.under))
-    own = x.shape[1]
-    rows |= {name: 100 * (depths[:, :own] > least).mean(axis=1) for name, least in INSIDE.items()}
-    for name, part in zip(PARTS, np.split(depths, (own, own + len(edges)), axis=1), strict=True):
-        if part.size:
-            rows[f"{name}penetrating"] = 100 * (part > 0).mean(axis=1)
-            rows[f"{name}depth_max"] = 1000 * np.maximum(part.max(axis=1), 0)
-    first = np.concatenate([np.arange(own), edges[:, 0], faces[:, 0]])
-    return rows | {"deepest": first[depths.argmax(axis=1)]}
+    depths = depths_on_host(x, skin, np.asarray(model.surface.faces), layered=bool(model.under))
+    rows |= {name: 100 * (depths > least).mean(axis=1) for name, least in INSIDE.items()}
+    return rows | {"penetrating": 100 * (depths > 0).mean(axis=1), "depth_max": 1000 * np.maximum(depths.max(axis=1), 0)}
 
 
 def summarise(rows: dict[str, np.ndarray]) -> dict[str, float]:

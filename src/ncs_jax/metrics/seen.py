@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -12,15 +12,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ncs_jax.energies.terms import Terms
-from ncs_jax.errors import InputError, shaped
+from ncs_jax.errors import InputError, required, shaped
 from ncs_jax.geometry.triangle_crossings import crossed
-from ncs_jax.metrics.skin import covered_skin, skin_pixels
+from ncs_jax.metrics.skin import CoveredSkin, covered_skin, skin_pixels
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body, resting_body
 
-__all__ = ["EVERY", "measure_seen"]
+__all__ = ["EVERY", "SkinShown", "measure_seen", "shown_skin", "touchable_bodies"]
 
 EVERY = 5  # one frame in so many is looked at
+LOOKED_AT = 24  # frames, where it is to be quick
+VISIBLE = 20  # pixels of skin, of 256 for the garment's largest side, that a person sees in passing: 2 cm^2 of a dress
 BLOCK = 16  # frames whose bodies are posed at once, so that motions of every length share one compilation
 
 
@@ -57,21 +59,60 @@ def measure_seen(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         rows = {"self_intersecting": np.array([100.0 * f.mean() for f in pool.map(lambda frame: crossed(frame, cloth), x)])}
         if model.surface is not None:
-            faces = np.asarray(model.surface.faces)
-            skin = covered_skin(resting_body(model), faces, np.asarray(model.garment.mesh.rest), cloth)
+            faces, skin = np.asarray(model.surface.faces), _covered(model)
 
             def look(frame: int) -> tuple[float, int, int]:
                 through = crossed(x[frame], cloth, body[frame], faces)
-                return 100.0 * float(through.mean()), *skin_pixels(skin, body[frame], x[frame])
+                shown, seen = skin_pixels(skin, body[frame], x[frame])
+                return 100.0 * float(through.mean()), len(shown), seen
 
-            body = _bodies(model, track, chosen)
+            body = touchable_bodies(model, track, chosen)
             through, shown, seen = (np.array(part, np.float64) for part in zip(*pool.map(look, range(len(x))), strict=True))
             rows |= {"body_intersecting": through, "skin_pixels": shown, "skin_share": 100 * shown / np.maximum(seen, 1)}
     return rows
 
 
-def _bodies(model: Model, track: MotionFeatures, chosen: np.ndarray) -> np.ndarray:
-    """Return the body in some frames, (frames, body, 3) in m, measured from the track's origin."""
+@dataclass(frozen=True)
+class SkinShown:
+    """In how many frames of an animation skin shows, and where most.
+
+    Attributes:
+        looked: how many frames were looked at. shown: in how many of these it is seen, in `VISIBLE` pixels and more of
+            `skin.skin_pixels`. frame, pixels: the worst, and in how many it shows there. vertex: of the skin that shows most
+            there, as `model.surface` numbers it; 0 where none does.
+    """
+
+    looked: int
+    shown: int
+    frame: int
+    pixels: int
+    vertex: int
+
+
+def shown_skin(model: Model, vertices: np.ndarray, body: np.ndarray, frames: np.ndarray) -> SkinShown:
+    """Return where skin shows in some frames of an animation, and compile nothing.
+
+    Args:
+        vertices: (looked, verts, 3) in m, of these frames. body: (looked, body, 3) in m, as `model.surface` numbers it, such as
+            `touchable_bodies`. frames: (looked,) their numbers.
+    """
+    x, body, skin = vertices.astype(np.float64), body.astype(np.float64), _covered(model)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        shown = list(pool.map(lambda k: skin_pixels(skin, body[k], x[k])[0], range(len(x))))
+    pixels = np.array([len(faces) for faces in shown])
+    worst = int(pixels.argmax())
+    vertex = int(skin.faces[np.bincount(shown[worst]).argmax(), 0]) if pixels[worst] else 0
+    return SkinShown(len(x), int((pixels >= VISIBLE).sum()), int(frames[worst]), int(pixels[worst]), vertex)
+
+
+def _covered(model: Model) -> CoveredSkin:
+    """Return what is needed to count the pixels of skin that shows through the model's garment."""
+    mesh, faces = model.garment.mesh, np.asarray(required(model.surface, "model.surface").faces)
+    return covered_skin(resting_body(model), faces, np.asarray(mesh.rest), np.asarray(mesh.faces))
+
+
+def touchable_bodies(model: Model, track: MotionFeatures, chosen: np.ndarray) -> np.ndarray:
+    """Return what the garment may touch in some frames, (frames, body, 3) in m, measured from the track's origin."""
     bare = replace(model, terms=Terms(), vibrations=None)  # the same program whatever the terms
     blocks = []
     for first in range(0, len(chosen), BLOCK):

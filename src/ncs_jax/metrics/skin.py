@@ -98,8 +98,8 @@ def _beyond(layers: Fragments, points: np.ndarray, size: tuple[int, int], sign: 
     return there, layers.face[at[there]]
 
 
-def skin_pixels(skin: CoveredSkin, body: np.ndarray, garment: np.ndarray) -> tuple[int, int]:
-    """Return in how many pixels skin shows through a garment in one frame, and in how many either of them is seen there.
+def skin_pixels(skin: CoveredSkin, body: np.ndarray, garment: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the face of skin that shows through a garment in one frame, pixel by pixel, and in how many either is seen there.
 
     Six views are looked at, level ones from four sides, from above and from below, along the world's axes, without
     perspective. A pixel shows skin through the garment if, along its ray, in order of the distance s from the eye,
@@ -120,7 +120,7 @@ def skin_pixels(skin: CoveredSkin, body: np.ndarray, garment: np.ndarray) -> tup
     faces = np.concatenate([skin.faces, skin.cloth + len(body)])
     corners = both[faces]
     covered = np.concatenate([skin.covered, np.zeros(len(skin.cloth), bool)])
-    shown = seen = 0
+    shown, seen = [], 0
     for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3
         width, height = (int(np.ceil((high - low)[k] / pixel)) + 1 for k in (first, second))
@@ -130,18 +130,19 @@ def skin_pixels(skin: CoveredSkin, body: np.ndarray, garment: np.ndarray) -> tup
         for order, facing in ((slice(None, None, -1), up > 0), (slice(None), up < 0)):
             own = Fragments(*(part[order] for part in layers))
             some, every = _count(own, facing, covered, len(skin.faces), REACH / pixel)
-            shown, seen = shown + some, seen + every
-    return shown, seen
+            shown.append(some)
+            seen += every
+    return np.concatenate(shown), seen
 
 
-def _count(layers: Fragments, facing: np.ndarray, covered: np.ndarray, bare: int, reach: float) -> tuple[int, int]:
-    """Count pixels of a view, whose fragments are in order of the distance: skin that shows, and this or cloth.
+def _count(layers: Fragments, facing: np.ndarray, covered: np.ndarray, bare: int, reach: float) -> tuple[np.ndarray, int]:
+    """Return the face of skin that shows, pixel by pixel of a view, and in how many either is seen; fragments are by depth.
 
     facing: which faces look at the eye; the first `bare` ones are the body's. reach: as the depths are.
     """
     count = len(layers.pixel)
     if not count:
-        return 0, 0
+        return np.zeros(0, np.int64), 0
     start = np.flatnonzero(np.diff(layers.pixel, prepend=-1))
     skin = (layers.face < bare) & facing[layers.face]
     # the next fragment that is no skin: cloth, or where the ray leaves the body
@@ -151,4 +152,4 @@ def _count(layers: Fragments, facing: np.ndarray, covered: np.ndarray, bare: int
     beneath &= np.abs(layers.depth[then] - layers.depth[start]) < reach
     front = layers.face[start]
     shown = skin[start] & covered[front] & beneath
-    return int(shown.sum()), int((shown | (front >= bare)).sum())
+    return front[shown], int((shown | (front >= bare)).sum())

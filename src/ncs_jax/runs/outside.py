@@ -2,44 +2,65 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ncs_jax.energies.contact.halfway import halfway_from
 from ncs_jax.energies.contact.layers import rim_ways
 from ncs_jax.energies.contact.outside import put_outside
-from ncs_jax.errors import required
+from ncs_jax.energies.contact.points import contact_points
+from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.geometry.enclosure import beside
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body, resting_body
 
-__all__ = ["outside", "outside_body", "pushing"]
+__all__ = ["Pushing", "outside", "outside_body", "pushing"]
 
 BLOCK = 32  # frames at a time
+PIECES = 2  # into which every edge is cut
 MARGIN = 0.75  # of the thickness: with half of it a knee still showed between points; cloth at rest lies farther out
 
 
-def pushing(model: Model) -> Float[Array, "body"] | None:
-    """Return 1 for the vertices of the touchable body that put cloth outside, 0 for the others; None without contact.
+class Pushing(NamedTuple):
+    """What puts a garment outside of the body.
 
-    Skin `beside` the garment at rest, as that of an arm which presses into a dress, does not: cloth would go around it.
+    surface: the model's, with points in the middle of every edge: where a network has stretched cloth, or beyond the poses that
+    contact was planned for, skin shows between those that it trains with. skin: 1 for vertices of the touchable body that push,
+    0 for the others.
+    """
+
+    surface: Surface
+    skin: Float[Array, "body"]
+
+
+def pushing(model: Model) -> Pushing | None:
+    """Return what puts the model's garment outside of the body; None without contact.
+
+    Skin `beside` the garment at rest, as that of an arm which presses into a dress, does not push: cloth would go around it.
     """
     if model.surface is None:
         return None
-    mesh = model.garment.mesh
-    return jnp.asarray(~beside(resting_body(model), np.asarray(mesh.rest), np.asarray(mesh.faces)), model.basis.dtype)
+    body, mesh = resting_body(model), model.garment.mesh
+    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
+    points = contact_points(faces, np.full(len(faces), PIECES))
+    surface = replace(model.surface, points=points, halfway=model.surface.halfway or halfway_from(body))
+    return Pushing(surface, jnp.asarray(~beside(body, rest, faces), model.basis.dtype))
 
 
 def outside(
-    model: Model, skin: Float[Array, "body"], matrices: Float[Array, "joints 3 4 *poses"], x: Float[Array, "verts 3 *poses"]
+    model: Model, by: Pushing, matrices: Float[Array, "joints 3 4 *poses"], x: Float[Array, "verts 3 *poses"]
 ) -> Float[Array, "verts 3 *poses"]:
     """Return the garment put outside of the body by `put_outside`, to `MARGIN` of the contact's thickness, m.
 
     Of garments worn together, each is then put outside of those below it, from the skin outwards.
     """
-    surface, margin = required(model.surface, "model.surface"), MARGIN * model.material.thickness
-    x = put_outside(x, pose_body(model, matrices), surface, skin, margin)
+    margin = MARGIN * model.material.thickness
+    x = put_outside(x, pose_body(model, matrices), by.surface, by.skin, margin)
     for upper in model.garment.uppers:
         lower, own, below = x[: upper.first], x[upper.first : upper.stop], upper.below
         found = put_outside(own, lower, below, jnp.ones(upper.first, x.dtype), margin, rim_ways(lower, below))
@@ -48,8 +69,8 @@ def outside(
 
 
 @jax.jit
-def _outside(model: Model, skin, matrices: Float[Array, "frames joints 3 4"], x: Float[Array, "frames verts 3"]):
-    return jnp.moveaxis(outside(model, skin, jnp.moveaxis(matrices, 0, -1), jnp.moveaxis(x, 0, -1)), -1, 0)
+def _outside(model: Model, by: Pushing, matrices: Float[Array, "frames joints 3 4"], x: Float[Array, "frames verts 3"]):
+    return jnp.moveaxis(outside(model, by, jnp.moveaxis(matrices, 0, -1), jnp.moveaxis(x, 0, -1)), -1, 0)
 
 
 def outside_body(model: Model, track: MotionFeatures, vertices: np.ndarray) -> np.ndarray:
@@ -57,11 +78,11 @@ def outside_body(model: Model, track: MotionFeatures, vertices: np.ndarray) -> n
 
     In a scene without contact it is returned as it is.
     """
-    skin, frames = pushing(model), len(vertices)
-    if skin is None:
+    by, frames = pushing(model), len(vertices)
+    if by is None:
         return vertices
     x, found = track.relative(vertices).astype(model.basis.dtype, copy=False), np.empty_like(vertices)
     for first in range(0, frames, BLOCK):
         at = np.minimum(np.arange(first, first + BLOCK), frames - 1)
-        found[first : first + BLOCK] = np.asarray(_outside(model, skin, track.matrices[at], x[at]))[: frames - first]
+        found[first : first + BLOCK] = np.asarray(_outside(model, by, track.matrices[at], x[at]))[: frames - first]
     return found if track.origin is None else found + np.asarray(track.origin)[:, None]

@@ -38,16 +38,16 @@ def serve_frames(run: Run, source: BinaryIO, sink: BinaryIO) -> int:
     names = names or [str(j) for j in range(max(model.source_joints) + 1 if body is None else len(body.parents))]
     chosen, dtype = np.array(model.source_joints), model.garment.mesh.rest.dtype
     rollout = stepper(model, run.assembly.network, run.params)
-    skin = None if model.under else pushing(model)  # where the garments below are, a stream does not know
+    by = None if model.under else pushing(model)  # where the garments below are, a stream does not know
 
     @jax.jit
     def step(state, rotations, translation, alpha):
         if model.rest_rotations is not None:
             rotations = to_rest_axes(rotations, model.rest_rotations)
         state, x = rollout.step(state, rotations, translation, alpha)
-        if skin is not None:
+        if by is not None:
             matrices = transforms(model.skeleton, forward(model.skeleton, rotations, translation))
-            x = outside(model, skin, matrices, x)
+            x = outside(model, by, matrices, x)
         return state, x
 
     def answer(state, frame: np.ndarray):

@@ -5,14 +5,15 @@ from __future__ import annotations
 import csv
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from ncs_jax.errors import InputError
-from ncs_jax.metrics.quality import PARTS, measure_on_host, summarise
+from ncs_jax.metrics.quality import measure_on_host, summarise
+from ncs_jax.metrics.seen import shown_skin
 from ncs_jax.runs.run import Run
 from ncs_jax.view import curves, page, pictures, video
 from ncs_jax.view.animation import Animation
@@ -24,7 +25,6 @@ ALPHAS = (0.0, 1.0, 1.5)
 TILE = 400  # pixels; height of a moment in the picture
 MOMENTS = 8  # in the picture of the alphas
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
-BARE = 1.0  # mm outside the cloth, from which skin is said to show
 NAMED = 8  # motions that a run trained on which the page names
 MEASURED = 24  # frames, at most, of which strain and penetration are measured
 
@@ -53,8 +53,8 @@ def preview(
     Cloth is put outside of the body, as by `ncs animate`. Alphas are in rows, where they differ most. The picture and the page
     come first, the measures last, and the page is then written again with them. Strain and penetration are exact, of every
     n-th frame, at most `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what
-    `metrics.quality` says of penetration; every, n; measured, frames. Where skin is 1 mm outside: bare, in how many; barest,
-    the worst, and a vertex there, barest_vertex. Curves need a log and matplotlib.
+    `metrics.quality` says of penetration; every, n; and what `metrics.seen.SkinShown` has, as skin_looked and so on. Curves
+    need a log and matplotlib.
 
     Args:
         run: trained.
@@ -151,21 +151,18 @@ def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
 
 
 def _measured(run: Run, animation: Animation) -> dict[str, float]:
-    """Return mean strain and penetration of every n-th frame."""
+    """Return mean strain and penetration of every n-th frame, and where skin shows."""
     every, skin = -(-len(animation.garment) // MEASURED), None
     if animation.body is not None:
         part, whole = run.assembly.prepared.part, animation.body.vertices
         count = whole.shape[1] - animation.body.worn
         skin = np.concatenate([whole[::every, part], whole[::every, count:]], axis=1)
-    rows = measure_on_host(run.assembly.model, animation.garment[::every], skin)
-    deepest = rows.pop("deepest", np.zeros(0))
-    found = summarise(rows) | {"every": float(every), "measured": float(len(rows["strain_mean"]))}
-    if "depth_max" in rows:
-        out = np.max([rows[f"{part}depth_max"] for part in PARTS], axis=0)
-        if out.max() > BARE:
-            worst = out.argmax()
-            found |= {"bare": float((out > BARE).sum()), "barest": float(every * worst), "barest_vertex": float(deepest[worst])}
-    return found
+    model, cloth = run.assembly.model, animation.garment[::every]
+    found = summarise(measure_on_host(model, cloth, skin)) | {"every": float(every)}
+    if skin is None:
+        return found
+    shown = shown_skin(model, cloth, skin, every * np.arange(len(cloth)))
+    return found | {f"skin_{name}": float(value) for name, value in asdict(shown).items()}
 
 
 def _draw_curves(folder: Path, log: Path) -> Path | None:

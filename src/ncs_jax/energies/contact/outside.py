@@ -19,7 +19,7 @@ from ncs_jax.geometry.soa_vectors import direction, dot, minus, plus, times
 __all__ = ["put_outside"]
 
 ROUNDS = 3
-NEAR, FAR = 0.02, 0.04  # m from the skin: up to where its normal there says what is inside, and from where it does not
+NEAR, FAR = 0.04, 0.08  # m from the skin: up to where its normal there says what is inside, and from where it does not
 AT_ONCE = 64  # points that are looked at in one turn, for each pose
 
 
