@@ -765,6 +765,8 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     (again,) = json.loads(capsys.readouterr().out).values()
     assert whole["mean"].pop("gain") > 0  # over what alpha = 0 gives, which a file does not tell
     assert whole["mean"].pop("outside") == 0 == whole["beyond"]["outside"]  # of what the run was trained on
+    assert whole["beyond"]["strain"] == pytest.approx(1, abs=0.1) and not whole["beyond"]["told"]
+    assert run.trained.strain == pytest.approx(whole["mean"]["strain_mean"], rel=0.1)
     for name, value in whole["mean"].items():
         assert again["mean"][name] == pytest.approx(value, rel=2e-3, abs=1e-3), name
     assert main(["evaluate", str(folder)]) == 0

@@ -7,7 +7,7 @@ import pytest
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.metrics.coverage import FAR, KEPT, TOLD, _nearest, coverage, trained_motion
+from ncs_jax.metrics.coverage import FAR, KEPT, STRAINED, TOLD, _nearest, coverage, trained_motion
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.runs.checkpoint import read_trained, write_trained
 from ncs_jax.runs.run import Run
@@ -76,13 +76,27 @@ def test_speeds_beyond_count_where_a_network_reads_them(known):
     assert seen(trained, assembly, slower).distance.max() <= 1
 
 
+def test_cloth_strained_more_than_in_training_is_told_whatever_the_pose(known):
+    """Its energy is quadratic: at `STRAINED` times it is a tenth above; where the strain is known, it decides."""
+    assembly, trained = known
+    assert seen(trained, assembly, record(), strain=3.0).strain == 0  # a run of an earlier version has none to compare with
+    trained = replace(trained, strain=1.5)
+    for ratio, told in ((0.8, False), (STRAINED - 0.01, False), (STRAINED + 0.01, True)):
+        found = seen(trained, assembly, record(), strain=1.5 * ratio)
+        assert found.strain == pytest.approx(ratio) and found.told == told and not found.outside.any()
+    assert found.excess == pytest.approx(TOLD, rel=0.05) and found.facts()["strain"] == round(STRAINED + 0.01, 3)
+    assert "near the poses" in str(found) and "strained 1.5 times as much as on these; adapt it" in str(found)
+    far = seen(trained, assembly, record(size=1.3), strain=1.5)
+    assert far.outside.any() and far.excess == 0 and not far.told and "strained" not in str(far)
+
+
 def test_few_poses_are_kept_and_every_trained_one_is_near_one(known, rng):
     assembly, _ = known
     motion = record()
     many = replace(motion, poses=rng.normal(size=(2000, 2, 3)).astype(np.float32), translation=np.zeros((2000, 3), np.float32))
     track = features_from_records(assembly.model, many)
     trained = trained_motion(assembly.model, track)
-    assert np.bincount(trained.joint).tolist()[1] == KEPT and sum(a.nbytes for a in vars(trained).values()) < 50_000
+    assert np.bincount(trained.joint).tolist()[1] == KEPT and sum(np.asarray(a).nbytes for a in vars(trained).values()) < 50_000
     found = coverage(trained, assembly.model, track)
     assert np.mean(found.poses > 0.02) < 0.06 and trained.radius[1] > FAR > trained.radius[0]  # gravity lies on a sphere
 
@@ -99,6 +113,11 @@ def test_it_is_kept_and_found_again_where_it_was_not(known, tmp_path):
     write_trained(tmp_path, trained)
     back = read_trained(tmp_path)
     assert all(np.array_equal(a, b) for a, b in zip(vars(back).values(), vars(trained).values(), strict=True))
+    write_trained(tmp_path, replace(trained, strain=1.25))
+    assert read_trained(tmp_path).strain == 1.25
+    earlier = {name: value for name, value in vars(trained).items() if name != "strain"}
+    np.savez(tmp_path / "trained.npz", **earlier)
+    assert read_trained(tmp_path).strain == 0
     (tmp_path / "trained.npz").write_bytes((tmp_path / "trained.npz").read_bytes()[:200])
     with pytest.raises(InputError, match=r"trained\.npz"):
         read_trained(tmp_path)

@@ -1,7 +1,7 @@
-"""How far a motion is from the motions that a garment was trained on, joint by joint, in poses and in speeds.
+"""How far a motion is from the motions that a garment was trained on, joint by joint, in poses and in speeds, and in strain.
 
 A network is at the energy of a simulation where it was trained. Beyond, its energy rises with the distance of the pose: see
-`FAR`.
+`FAR`. How steeply depends on garment and training; how much more it strains the cloth than there tells it for each: `STRAINED`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ __all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "trained_motion"]
 FAR = 0.2  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
 FAST = 2.0  # times the largest trained rate, and twice as much of the accelerations, are the limit
 GROWTH = 1.4  # power of the distance with which the energy rises beyond
+STRAINED = 1.5  # times the mean strain of trained motions, at which the energy is as much above
 TOLD = 0.1  # of the energy, above which a motion is told to be beyond
 CARRIED = 0.005  # of the garment, that a joint and those below it carry at least, if it counts
 KEPT = 1024  # poses of a joint, at most
@@ -39,6 +40,7 @@ class TrainedMotion:
         joint: (kept,) of which joint each is, of those that carry the garment.
         radius: (joints,) how far 19 of 20 trained poses are from the nearest kept one, at most.
         rates: (joints,) the largest rate of such a pose, 1/s. accelerations: (joints,) of each joint, m/s^2.
+        strain: the mean of its edges' strain over these motions, %, once trained; 0 where nobody knows.
     """
 
     poses: Float[np.ndarray, "kept 9"]
@@ -46,6 +48,7 @@ class TrainedMotion:
     radius: Float[np.ndarray, "joints"]
     rates: Float[np.ndarray, "joints"]
     accelerations: Float[np.ndarray, "joints"]
+    strain: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -55,11 +58,13 @@ class Coverage:
     Attributes:
         poses, speeds: (frames, joints) distance of each joint's pose and speed as a share of the limit: 1 is at the limit.
         joints: their names.
+        strain: the garment's mean strain over that on the motions that it was trained on; 0 where nobody knows.
     """
 
     poses: Float[np.ndarray, "frames joints"]
     speeds: Float[np.ndarray, "frames joints"]
     joints: tuple[str, ...]
+    strain: float = 0.0
 
     @property
     def distance(self) -> Float[np.ndarray, "frames"]:
@@ -78,7 +83,14 @@ class Coverage:
 
     @property
     def excess(self) -> float:
-        """Return how much more energy is to be expected than adapting to the motion reaches, as a share of it."""
+        """Return how much more energy is to be expected than adapting to the motion reaches, as a share of it.
+
+        By the strain r, as its energy is quadratic, else by the distances d:
+
+            `TOLD` (r^2 - 1) / (`STRAINED`^2 - 1),   mean over frames of `TOLD` d^`GROWTH`
+        """
+        if self.strain:
+            return TOLD * max(self.strain**2 - 1, 0.0) / (STRAINED**2 - 1)
         return float(np.mean(TOLD * self.distance**GROWTH))
 
     @property
@@ -97,16 +109,20 @@ class Coverage:
         """Return all of it as JSON has it."""
         frame, joint, what = self.worst
         worst = {"frame": frame, "joint": joint, "by": what}
-        return {"outside": round(self.share, 4), "worst": worst, "told": self.told, "means": str(self)}
+        found = {"outside": round(self.share, 4), "worst": worst, "strain": round(self.strain, 3)}
+        return found | {"told": self.told, "means": str(self)}
 
     def __str__(self) -> str:
-        """Return the share of frames, the worst of them, and what helps, in a sentence."""
-        if not self.outside.any():
-            return "every frame is near the poses and speeds that the run was trained on"
-        frame, joint, what = self.worst
-        text = f"{self.share:.0%} of the frames are beyond the poses and speeds that the run was trained on"
-        text += f", frame {frame} most, by the {what} of {joint}"
-        return f"{text}; adapt it with --adapt 20 (in Python ncs_jax.adapt), or train on such motion" if self.told else text
+        """Return the share of frames, the worst of them, the strain, and what helps, in a sentence."""
+        text = "every frame is near the poses and speeds that the run was trained on"
+        if self.outside.any():
+            frame, joint, what = self.worst
+            text = f"{self.share:.0%} of the frames are beyond the poses and speeds that the run was trained on"
+            text += f", frame {frame} most, by the {what} of {joint}"
+        if not self.told:
+            return text
+        strain = f"; cloth is strained {self.strain:.1f} times as much as on these" if self.strain else ""
+        return f"{text}{strain}; adapt it with --adapt 20 (in Python ncs_jax.adapt), or train on such motion"
 
 
 def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
@@ -122,7 +138,13 @@ def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
 
 
 def coverage(
-    trained: TrainedMotion, model: Model, track: MotionFeatures, *, names: Sequence[str] = (), moving: bool = True
+    trained: TrainedMotion,
+    model: Model,
+    track: MotionFeatures,
+    *,
+    names: Sequence[str] = (),
+    moving: bool = True,
+    strain: float = 0.0,
 ) -> Coverage:
     """Return how far the frames of a track are from what a run was trained on.
 
@@ -131,6 +153,7 @@ def coverage(
 
     Args:
         names: of the body's joints; their numbers where there are none. moving: whether the network reads speeds at all.
+        strain: mean over the track's frames of the garment's, %, as the network has it; 0 where nobody knows.
     """
     poses, rates, accelerations = _described(model, track)
     far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1)
@@ -138,7 +161,8 @@ def coverage(
     fast = rates / np.maximum(FAST * trained.rates, STILL[0])
     fast = np.maximum(fast, accelerations / np.maximum(2 * FAST * trained.accelerations, STILL[1]))
     numbers = [model.source_joints[j] for j in _carrying(model)]
-    return Coverage(far, fast if moving else np.zeros_like(far), tuple(names[n] if names else str(n) for n in numbers))
+    called = tuple(names[n] if names else str(n) for n in numbers)
+    return Coverage(far, fast if moving else np.zeros_like(far), called, strain / trained.strain if trained.strain else 0.0)
 
 
 def _carrying(model: Model) -> np.ndarray:

@@ -146,7 +146,9 @@ def read_trained(run: Path) -> TrainedMotion | None:
     if not path.exists():
         return None
     table = read_npz(path, names.__contains__)
-    return TrainedMotion(**{name: table.array(name) for name in names})
+    strain = float(table.array("strain")) if "strain" in table else 0.0  # of an earlier version
+    poses, joint, radius, rates, accelerations = (table.array(name) for name in names[:-1])
+    return TrainedMotion(poses, joint, radius, rates, accelerations, strain)
 
 
 class Checkpoints:

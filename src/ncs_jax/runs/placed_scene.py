@@ -37,6 +37,7 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
+STRAINED = 40  # times as many, of which the mean strain is taken at the end
 POOL = 512  # poses put together of the motions' limbs, others after every checkpoint, where a scene trains on any
 FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
@@ -99,7 +100,16 @@ class PlacedScene:
 
     def measure(self, params: dict, done: int) -> dict[str, float]:
         """Return `training_metrics` of a few frames of the last of the `done` steps."""
-        arguments = self.model, params, self.features, self._ends(done - 1, 1)[0, :SEEN]
+        return self._measured(params, self._ends(done - 1, 1)[0, :SEEN])
+
+    def strain(self, params: dict) -> float:
+        """Return the mean strain of the garment on the motions that are trained on, %, of frames evenly spread."""
+        count = len(self._ends(0, 1)[0, :SEEN])  # of which the program is
+        ends = self._last[np.linspace(0, len(self._last) - 1, count * STRAINED).astype(int)].astype(np.int32)
+        return float(np.mean([self._measured(params, few)["strain"] for few in np.split(ends, STRAINED)]))
+
+    def _measured(self, params: dict, ends) -> dict[str, float]:
+        arguments = self.model, params, self.features, ends
         program = self._programs.ready("metrics", self._metrics, *arguments)
         return {k: float(v) for k, v in program(*jax.tree.leaves(arguments)).items()}
 

@@ -16,7 +16,7 @@ from ncs_jax.errors import InputError, check_alpha
 from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
 from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion
-from ncs_jax.metrics.quality import measure
+from ncs_jax.metrics.quality import measure, measure_on_host
 from ncs_jax.metrics.seen import EVERY, measure_seen
 from ncs_jax.network.compression import compress
 from ncs_jax.network.methods.method import Method, check_network
@@ -176,22 +176,26 @@ class Run:
         model, track = self.assembly.model, self.track(motion)
         x = self.animate(track, alpha)
         rows = (measure_seen(model, x, track, seen) if exact and seen else {}) | measure(model, x, track, exact=exact)
-        found = None if self.trained is None else self.coverage(track)
+        found = None if self.trained is None else self.coverage(track, x)
         return rows if found is None else rows | {"outside": 100.0 * found.outside}
 
-    def coverage(self, motion: str | io.MotionRecord | MotionFeatures) -> Coverage | None:
-        """Return how far each frame of a motion is from the poses and speeds that the run was trained on.
+    def coverage(self, motion: str | io.MotionRecord | MotionFeatures, vertices: np.ndarray | None = None) -> Coverage | None:
+        """Return how far each frame of a motion is from the poses and speeds that the run was trained on, and how strained.
 
             found = run.coverage("dance.bvh")
             found.share, found.worst   # of the frames that are beyond; frame, joint, and whether by its pose or its speed
 
-        None where nobody knows: of a run of an earlier version whose motions cannot be read any more.
+        vertices: what `animate` gives for this motion, where that is there already. None is returned where nobody knows: of a
+        run of an earlier version whose motions cannot be read any more.
         """
         a, trained = self.assembly, self.known()
         if trained is None:
             return None
-        names = a.body.joint_names if a.body is not None else ()
-        return coverage(trained, a.model, self.track(motion), names=names, moving=a.network.state > 0)
+        names, track, strain = a.body.joint_names if a.body is not None else (), self.track(motion), 0.0
+        if trained.strain:
+            x = self.animate(track) if vertices is None else vertices
+            strain = float(measure_on_host(a.model, x)["strain_mean"].mean())
+        return coverage(trained, a.model, track, names=names, moving=a.network.state > 0, strain=strain)
 
     def known(self) -> TrainedMotion | None:
         """Return what the run was trained on, found again from the motions of its scene where it was not kept."""

@@ -214,9 +214,13 @@ class _Output:
         if self._out is not None and (there := read_trained(self._out)) is not None:
             return there
         trained = trained_motion(self._placed.assembly.model, self._placed.assembly.track)
+        self.write_motion(trained)
+        return trained
+
+    def write_motion(self, trained: TrainedMotion) -> None:
+        """Write down what the run is trained on."""
         if self._out is not None:
             write_trained(self._out, trained)
-        return trained
 
     @property
     def started(self) -> bool:
@@ -309,7 +313,10 @@ class _Loop:
             what = f"{lost} of {self._steps - self._first} steps were dropped, in which something was not finite"
             last = placed.diagnose(placed.local(self._state))
             warnings.warn(f"{what}: nothing was learned in them; the last one: {last}", InputWarning, stacklevel=4)
-        return Run(placed.assembly, placed.local(self._state.params), self._steps, trained=trained)
+        params = placed.local(self._state.params)
+        trained = replace(trained, strain=placed.strain(params))
+        self._output.write_motion(trained)
+        return Run(placed.assembly, params, self._steps, trained=trained)
 
     def _take(self, at: int, count: int) -> None:
         """Take the steps at to at + count, report them, and keep a checkpoint where one is due."""
