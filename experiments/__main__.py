@@ -203,8 +203,9 @@ Every claim of the method as an experiment on the packaged garments. `make study
 
 
 def study(steps: int, falls: int, results: Path, kept: Path) -> None:
-    """Run every experiment."""
-    began = time.monotonic()
+    """Run every experiment; the time of a study that was interrupted counts too."""
+    clock = kept / "minutes.txt"
+    spent, began = float(clock.read_text()) if clock.exists() else 0.0, time.monotonic()
     for name, (title, module, scene, times, _) in SECTIONS.items():
         if module is falling:
             rows = falling.experiment(results, falls)
@@ -212,9 +213,12 @@ def study(steps: int, falls: int, results: Path, kept: Path) -> None:
             loaded = load_scene(scene)
             more = (name,) if module is methods else ()
             rows = module.experiment(loaded, standing(loaded, UNSEEN, kept), times * steps, results, kept, *more)
-        print(f"{(time.monotonic() - began) / 60:5.1f} min  {title}: {module.conclusion(rows)}", flush=True)
+        minutes = spent + (time.monotonic() - began) / 60
+        clock.write_text(f"{minutes}")
+        print(f"{minutes:5.1f} min  {title}: {module.conclusion(rows)}", flush=True)
     with (results / "study.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["steps", "minutes"], [steps, (time.monotonic() - began) / 60]])
+        csv.writer(file).writerows([["steps", "minutes"], [steps, minutes]])
+    clock.unlink()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
