@@ -3,7 +3,7 @@
     python -m experiments.limits RUN MOTION [MOTION ...] [--adapt 20] [--out runs/limits]
 
 A motion is beyond what was trained where the network's energy is more than a tenth above what adapting to it reaches, by the
-same measure of both; the run tells it beforehand, from poses and speeds alone (`ncs_jax.metrics.coverage`). It is told rightly
+same measure of both; the run tells it beforehand, by how strained the cloth is (`ncs_jax.metrics.coverage`). It is told rightly
 where both say the same. Writes limits.csv, limits.md, and a picture of the one over the other.
 """
 
