@@ -14,10 +14,12 @@ from ncs_jax.energies.contact.points import contact_points, with_points
 from ncs_jax.energies.contact.surface import surface_from, vertex_normals
 from ncs_jax.geometry.closest_point import triangle_square
 from ncs_jax.metrics.quality import measure
-from ncs_jax.runs.outside import outside_body
+from ncs_jax.runs.outside import LIMB, STRETCHED, outside_body, pushing
+from ncs_jax.runs.outside import MARGIN as MARGIN_OF
 from ncs_jax.runs.run import load_run
 from ncs_jax.runs.train import train
 
+from .ready import assembled
 from .scenes import SCENE, swing, write_scene
 from .shapes import ball, tube
 
@@ -136,3 +138,23 @@ def test_without_contact_nothing_is_put_anywhere(trained, _plain):
     run, clip = trained
     x = run.animate(clip)
     assert outside_body(replace(run.assembly.model, surface=None), run.track(clip), x) is x
+
+
+def test_edges_that_would_sink_into_a_limb_are_looked_at_in_their_middle():
+    """The longest of a triangle's edges against sqrt(8 LIMB margin) / STRETCHED; what contact looks at stays."""
+    model = assembled().model
+    mesh = model.garment.mesh
+    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
+    longest = np.max([np.linalg.norm(rest[faces[:, k]] - rest[faces[:, k - 1]], axis=1) for k in range(3)], axis=0)
+    margin = (STRETCHED * longest.max()) ** 2 / (8 * LIMB)
+
+    def points(thickness, **surface):
+        material = replace(model.material, thickness=jnp.float32(thickness))
+        return pushing(replace(model, material=material, surface=replace(model.surface, **surface))).surface
+
+    few, every = points(1.01 * margin / MARGIN_OF), points(0.2 * margin / MARGIN_OF)
+    assert few.points is None and few.halfway is None
+    assert len(every.points.corners) == len(mesh.edges) and every.halfway is not None
+    own = contact_points(faces, np.where(np.arange(len(faces)) == 3, 2, 1))
+    kept = points(1.01 * margin / MARGIN_OF, points=own).points
+    assert np.array_equal(kept.corners, own.corners) and np.array_equal(kept.weights, own.weights)

@@ -22,16 +22,15 @@ from ncs_jax.scene.model import Model, pose_body, resting_body
 __all__ = ["Pushing", "outside", "outside_body", "pushing"]
 
 BLOCK = 32  # frames at a time
-PIECES = 2  # into which every edge is cut
+STRETCHED, LIMB = 2.0, 0.05  # times its length, around a limb of such a radius, m: cloth that must not sink between points
 MARGIN = 0.75  # of the thickness: with half of it a knee still showed between points; cloth at rest lies farther out
 
 
 class Pushing(NamedTuple):
     """What puts a garment outside of the body.
 
-    surface: the model's, with points in the middle of every edge: where a network has stretched cloth, or beyond the poses that
-    contact was planned for, skin shows between those that it trains with. skin: 1 for vertices of the touchable body that push,
-    0 for the others.
+    surface: the model's, with more points between vertices, see `pushing`. skin: 1 for vertices of the touchable body that
+    push, 0 for the others.
     """
 
     surface: Surface
@@ -41,15 +40,26 @@ class Pushing(NamedTuple):
 def pushing(model: Model) -> Pushing | None:
     """Return what puts the model's garment outside of the body; None without contact.
 
+    A network may stretch cloth beyond what contact was planned for, and skin shows between the points that it trains with. So
+    there are points in the middle of each edge that would sink by more than the margin if it were `STRETCHED` over a `LIMB`:
+
+        (STRETCHED L)^2 / (8 LIMB) > margin
+
     Skin `beside` the garment at rest, as that of an arm which presses into a dress, does not push: cloth would go around it.
     """
     if model.surface is None:
         return None
-    body, mesh = resting_body(model), model.garment.mesh
-    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
-    points = contact_points(faces, np.full(len(faces), PIECES))
-    surface = replace(model.surface, points=points, halfway=model.surface.halfway or halfway_from(body))
-    return Pushing(surface, jnp.asarray(~beside(body, rest, faces), model.basis.dtype))
+    body, mesh, surface = resting_body(model), model.garment.mesh, model.surface
+    rest, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
+    longest = np.linalg.norm(rest[faces] - rest[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
+    cut = (STRETCHED * longest) ** 2 / (8 * LIMB) > MARGIN * float(model.material.thickness)
+    if surface.points is not None:
+        numbered = np.array([len(rest) ** 2, len(rest), 1], np.int64)
+        cut |= np.isin(faces @ numbered, np.asarray(surface.points.corners) @ numbered)
+    points = contact_points(faces, np.where(cut, 2, 1))
+    halfway = None if points is None else surface.halfway or halfway_from(body)
+    skin = jnp.asarray(~beside(body, rest, faces), model.basis.dtype)
+    return Pushing(replace(surface, points=points, halfway=halfway), skin)
 
 
 def outside(
