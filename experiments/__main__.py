@@ -26,13 +26,6 @@ LONG = 5  # times as many steps for the methods side by side, and for motion con
 FALLS = 10_000
 
 
-# Until the study is made again: what of its tables is of code that has changed since.
-EARLIER = """- **Not of this version:** rows of a swing (`ncs`, "the garment's own vibrations") were
-  measured when the swing was added to the cloth and had no bound. That of today: `python -m experiments.fast_motion`.
-  The columns *two simulations*, *static part* and *dynamic*, and two of the simulations, came after these tables.
-"""
-
-
 class Section(NamedTuple):
     """A part of the page: an experiment's module, its garment, how many times the steps, and its pictures but for one."""
 
@@ -197,7 +190,7 @@ Every claim of the method as an experiment on the packaged garments. `make study
 - Minutes are by the clock. Other work on the machine adds to them, such as a second network that is trained at the same time.
   Milliseconds of a frame are those of one network alone.
 - Not a part of it is `python -m experiments.garments`: any folder of garments for a body, in the columns of HOOD.
-{EARLIER}"""
+"""
     parts = [head, mattered(results), *(written(results, name) for name in SECTIONS), repeated(results)]
     return "\n".join(filter(None, parts))
 
