@@ -37,7 +37,7 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
-STRAINED = 40  # times as many, of which the mean strain is taken at the end
+TIMES = 40  # times as many, of which the mean strain is taken at the end
 POOL = 512  # poses put together of the motions' limbs, others after every checkpoint, where a scene trains on any
 FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
@@ -105,8 +105,8 @@ class PlacedScene:
     def strain(self, params: dict) -> float:
         """Return the mean strain of the garment on the motions that are trained on, %, of frames evenly spread."""
         count = len(self._ends(0, 1)[0, :SEEN])  # of which the program is
-        ends = self._last[np.linspace(0, len(self._last) - 1, count * STRAINED).astype(int)].astype(np.int32)
-        return float(np.mean([self._measured(params, few)["strain"] for few in np.split(ends, STRAINED)]))
+        ends = self._last[np.linspace(0, len(self._last) - 1, count * TIMES).astype(int)].astype(np.int32)
+        return float(np.mean([self._measured(params, few)["strain"] for few in np.split(ends, TIMES)]))
 
     def _measured(self, params: dict, ends) -> dict[str, float]:
         arguments = self.model, params, self.features, ends

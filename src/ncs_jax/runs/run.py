@@ -34,7 +34,7 @@ from ncs_jax.training.step import initial_state
 __all__ = ["NetworkMaker", "Run", "assemble", "check_own", "load_run", "own_names", "read_animation_over", "worn_below"]
 
 
-STRAINED = 1024  # frames of a motion, at most, of which the strain is asked
+ASKED = 1024  # frames of a motion, at most, of which the strain is asked
 
 NetworkMaker = Callable[[Scene, Model], Method]  # makes a network of one's own, sized for a model
 
@@ -196,7 +196,7 @@ class Run:
         names, track, strain = a.body.joint_names if a.body is not None else (), self.track(motion), 0.0
         if trained.strain:
             x = self.animate(track) if vertices is None else vertices
-            strain = float(measure_on_host(a.model, x[:: -(-len(x) // STRAINED)])["strain_mean"].mean())
+            strain = float(measure_on_host(a.model, x[:: -(-len(x) // ASKED)])["strain_mean"].mean())
         return coverage(trained, a.model, track, names=names, moving=a.network.state > 0, strain=strain)
 
     def known(self) -> TrainedMotion | None:
