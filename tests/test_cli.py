@@ -541,7 +541,7 @@ def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, mo
     _, folder = run_folder
     monkeypatch.setattr("ncs_jax.view.pictures.render", lambda *_, **__: np.zeros((520, 400, 3), np.uint8))
     shutil.copy(folder.parent / "swing.npz", tmp_path / "other.npz")
-    monkeypatch.setattr("ncs_jax.view.preview.MEASURED", 8)
+    monkeypatch.setattr("ncs_jax.view.preview.LOOKED_AT", 8)
     # what is put outside of the post is so in all frames
     monkeypatch.setattr("ncs_jax.runs.outside.pushing", lambda model: None)
     # nothing of this post is covered so that it could show

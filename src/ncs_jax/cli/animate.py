@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ncs_jax.metrics.coverage import Coverage
     from ncs_jax.prepare.build import Assembly
     from ncs_jax.runs.run import Run
+    from ncs_jax.scene.features import MotionFeatures
 
 __all__ = ["add_commands", "animate", "export"]
 
@@ -113,22 +114,22 @@ def animate(options) -> int:
     drawn = _is_drawn(options)
     if not drawn:
         animation_suffix(options.out, with_body=options.body, also=(".mp4", ".png"))
-    run, motion, known = _run_and_motion(options)
+    run, motion, track, known = _run_and_motion(options)
     worn_by = None
     if options.body:
         if run.assembly.body is None:
             raise InputError("a scene with a body expected", file=options.folder, field="--body", mend="leave it out")
         worn_by = run.assembly.body, motion
     outside = not options.as_trained
-    vertices, error = run.animate(motion, options.alpha, outside=outside), ""
+    vertices, error = run.animate(track, options.alpha, outside=outside), ""
     if options.rank or options.bfloat16:
-        run = run.compressed(motion, rank=options.rank or 0, bfloat16=options.bfloat16)
-        whole, vertices = vertices, run.animate(motion, options.alpha, outside=outside)
+        run = run.compressed(track, rank=options.rank or 0, bfloat16=options.bfloat16)
+        whole, vertices = vertices, run.animate(track, options.alpha, outside=outside)
         apart = 1000 * np.linalg.norm(vertices - whole, axis=-1)
         error = f"; {np.mean(apart):.2g} mm from the whole decoder, {np.max(apart):.2g} at most"
     if options.refine:
-        vertices = _refined(run, motion, options.alpha, options.refine, outside)
-    _tell_skin(run, motion, vertices, known)
+        vertices = _refined(run, track, options.alpha, options.refine, outside)
+    _tell_skin(run, track, vertices, known)
     garment = run.assembly.garment
     fps = run.assembly.model.fps
     if drawn:
@@ -187,13 +188,13 @@ def _draw(run: Run, motion: MotionRecord, vertices: np.ndarray, options) -> str:
     return f"{options.out}: {len(vertices)} frames at {shown.fps:g} per second"
 
 
-def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int, outside: bool = False) -> np.ndarray:
+def _refined(run: Run, track: MotionFeatures, alpha: float, iterations: int, outside: bool = False) -> np.ndarray:
     """Return the animation after some iterations of the solver on every frame, with a bar."""
     from ncs_jax.cli.progress import WorkProgress
 
     with WorkProgress("compiling the solver") as progress:
         return run.animate(
-            motion,
+            track,
             alpha,
             refine=iterations,
             outside=outside,
@@ -201,7 +202,7 @@ def _refined(run: Run, motion: MotionRecord, alpha: float, iterations: int, outs
         )
 
 
-def _tell_skin(run: Run, motion: MotionRecord, vertices: np.ndarray, known: Coverage | None) -> None:
+def _tell_skin(run: Run, track: MotionFeatures, vertices: np.ndarray, known: Coverage | None) -> None:
     """Print where skin shows in the animation, of frames evenly spread and the one that is most beyond the training."""
     model = run.assembly.model
     if model.surface is None:
@@ -211,15 +212,14 @@ def _tell_skin(run: Run, motion: MotionRecord, vertices: np.ndarray, known: Cove
     from ncs_jax.cli.check import tell_skin
     from ncs_jax.metrics.seen import LOOKED_AT, shown_skin, touchable_bodies
 
-    track = run.track(motion)
     worst = () if known is None else (known.worst[0],)
     chosen = np.unique([*range(0, len(vertices), -(-len(vertices) // LOOKED_AT)), *worst])
     body = touchable_bodies(model, track, chosen)
     tell_skin(shown_skin(model, track.relative(vertices)[chosen], body, chosen), run.assembly)
 
 
-def _run_and_motion(options) -> tuple[Run, MotionRecord, Coverage | None]:
-    """Return the run to animate, adapted if that is asked for, the first of its motions, and how far it is beyond."""
+def _run_and_motion(options) -> tuple[Run, MotionRecord, MotionFeatures, Coverage | None]:
+    """Return the run, adapted if that is asked for, the first motion as read and made ready, and how far that is beyond."""
     from ncs_jax.cli.check import tell_beyond
     from ncs_jax.runs.run import load_run
 
@@ -241,9 +241,9 @@ def _run_and_motion(options) -> tuple[Run, MotionRecord, Coverage | None]:
         _tell_motions(run.assembly, options.notes)
     if options.adapt is not None:
         run = adapted(run, motions, options).run
-    known = run.coverage(records[motions[0]])
-    tell_beyond(known)
-    return run, records[motions[0]], known
+    track = run.track(motion := records[motions[0]])
+    tell_beyond(known := run.coverage(track))
+    return run, motion, track, known
 
 
 def _tell_motions(assembly: Assembly, whole: bool) -> None:
@@ -303,6 +303,6 @@ def _export_page(options) -> int:
         tell_beyond(run.coverage(motions[name]))
     refined = None
     if options.refine and motions:
-        refined = options.refine, _refined(run, next(iter(motions.values())), 1.0, options.refine)
+        refined = options.refine, _refined(run, run.track(next(iter(motions.values()))), 1.0, options.refine)
     print(write_living_page(options.out, run, motions, runtime, rank=options.rank, float16=options.float16, refined=refined))
     return 0

@@ -13,7 +13,7 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.metrics.quality import measure_on_host, summarise
-from ncs_jax.metrics.seen import shown_skin
+from ncs_jax.metrics.seen import LOOKED_AT, shown_skin
 from ncs_jax.runs.run import Run
 from ncs_jax.view import curves, page, pictures, video
 from ncs_jax.view.animation import Animation
@@ -26,7 +26,6 @@ TILE = 400  # pixels; height of a moment in the picture
 MOMENTS = 8  # in the picture of the alphas
 FPS, FRAMES, SIZE = 10.0, 80, (300, 375)  # of the GIF
 NAMED = 8  # motions that a run trained on which the page names
-MEASURED = 24  # frames, at most, of which strain and penetration are measured
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def preview(
 
     Cloth is put outside of the body, as by `ncs animate`. Alphas are in rows, where they differ most. The picture and the page
     come first, the measures last, and the page is then written again with them. Strain and penetration are exact, of every
-    n-th frame, at most `MEASURED`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what
+    n-th frame, at most `seen.LOOKED_AT`: `ncs evaluate` measures all, and the energies. Keys: strain_mean (%), with a body what
     `metrics.quality` says of penetration; every, n; and what `metrics.seen.SkinShown` has, as skin_looked and so on. Curves
     need a log and matplotlib.
 
@@ -152,7 +151,7 @@ def _facts_of(quantities: dict[str, float]) -> dict[str, str]:
 
 def _measured(run: Run, animation: Animation) -> dict[str, float]:
     """Return mean strain and penetration of every n-th frame, and where skin shows."""
-    every, skin = -(-len(animation.garment) // MEASURED), None
+    every, skin = -(-len(animation.garment) // LOOKED_AT), None
     if animation.body is not None:
         part, whole = run.assembly.prepared.part, animation.body.vertices
         count = whole.shape[1] - animation.body.worn
