@@ -16,7 +16,7 @@ from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare import garment_placement
-from ncs_jax.prepare.fit import BAND, bring_apart, fit, pins_of, settle
+from ncs_jax.prepare.fit import BAND, bring_apart, fit, pins_of, push_out, settle
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.hanging import RAYS, trunk_of
 from ncs_jax.prepare.wearing import cloth_of, skin_of
@@ -510,6 +510,24 @@ def test_a_start_that_intersects_ends_without_or_is_refused_with_its_faces(name)
     settled = settle("x.npz", found, body)
     assert not len(crossing_pairs(settled.garment.vertices, settled.garment.faces))
     assert settled.depth[1].max() < 0
+
+
+def test_cloth_gives_way_to_the_body_with_little_strain():
+    """A shirt 3 cm too far to the front: at the back all of it goes along, and not what lies in the body alone."""
+    given, body = twenty_starts()["shirt pushed 0.03 along (0, 0, 1)"], io.read_body("ncs:body")
+    edges = topology(given.faces)[0]
+
+    def strain(x):
+        lengths = [np.linalg.norm(np.diff(np.asarray(v, np.float64)[edges], axis=1)[:, 0], axis=1) for v in (x, given.vertices)]
+        return lengths[0] / lengths[1] - 1
+
+    found = place("x.npz", given, body, move=(0.0, 0.0, 0.0), scale=1.0, up="y", turn=0)
+    settled = settle("x.npz", found, body)
+    assert settled.depth[0].max() > 0.02 and settled.depth[1].max() < -0.0035
+    pushed = push_out(given.vertices.astype(np.float64), given.faces, body, settled.contact.thickness)
+    assert np.abs(strain(pushed)).max() > 1
+    assert np.abs(strain(settled.garment.vertices)).max() < 0.25
+    assert np.sqrt(np.mean(strain(settled.garment.vertices) ** 2)) < 0.04
 
 
 def test_cloth_that_is_apart_stays_as_it_is(body):

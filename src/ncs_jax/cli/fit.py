@@ -26,6 +26,7 @@ MOTIONS = (
 )
 FOUND = ("body.", "garment.", "physics.collision.", "physics.bending.")  # what fitting finds out, in a scene
 HOLES = 10  # so many small ones are listed
+TIGHT = 5.0  # %; a garment that is strained more by coming out of a body was not made for it
 LIMBS = {"left arm", "right arm", "left thigh", "right thigh"}  # whose joints the packaged motions must find
 
 
@@ -267,7 +268,9 @@ def _say_what(found, given, pins: str) -> None:
     x, parts = g.vertices, summarise_surface(g.vertices, g.faces)
     pushed = 1000 * np.linalg.norm(x - found.placement.garment.vertices, axis=1)
     print(f"  body      {(before > 0).sum()} vertices were inside, up to {1000 * max(before.max(), 0):.1f} mm; ", end="")
-    print(f"{(pushed > 0.01).sum()} moved, by {pushed.max():.1f} mm at most; {(after > 0).sum()} inside now")
+    print(f"cloth moved by {pushed.mean():.1f} mm, {pushed.max():.1f} at most; {(after > 0).sum()} inside now")
+    if pushed.max() > 0.01:
+        _say_strain(found)
     print(f"  clearance {-1000 * after.max():.1f} mm at least, {-1000 * after.mean():.1f} mm mean")
     _say_contact(found.contact)
     print(f"  surface   connected components {parts.components}, degenerate triangles {parts.degenerate}")
@@ -289,6 +292,24 @@ def _say_what(found, given, pins: str) -> None:
         print(f"  pins      none: {told}; if it slides off, --pins shoulders or --pins top")
     own = "the file's own" if given.weights is not None else "those of the skin, found when the scene is made ready"
     print(f"  weights   {own}")
+
+
+def _say_strain(found) -> None:
+    """Print how much the garment was strained by coming out of the body."""
+    import numpy as np
+
+    from ncs_jax.geometry.mesh import topology
+
+    ends = topology(found.garment.faces)[0]
+    before, after = (
+        np.linalg.norm(np.diff(np.asarray(x, np.float64)[ends], axis=1)[:, 0], axis=1)
+        for x in (found.placement.garment.vertices, found.garment.vertices)
+    )
+    strain = 100 * np.abs(after / np.maximum(before, 1e-12) - 1)
+    mean = np.sqrt(np.mean(strain**2))
+    print(f"  strain    its edges are {mean:.1f} % longer or shorter by that (r.m.s.), {strain.max():.0f} % at most")
+    if mean > TIGHT:
+        print("            so it was made for a slimmer body: give that one as --from, or a larger --scale")
 
 
 def _say_contact(contact) -> None:

@@ -26,6 +26,9 @@ __all__ = ["PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "p
 PINS = "pins"  # the vertex group that is written
 TRIES = 12  # of bringing cloth apart
 PUSHES, RINGS = 200, 6  # most rounds of pushing out; rings of vertices that follow a pushed one
+YIELDS, TURNS = 25, 2  # most rounds of giving way, and how often each finds the rotations anew
+FIRM, LOOSE = 2.0, 1e-3  # how strongly a vertex is drawn out of the body and held where it was, beside its edges
+SLACK = 5e-4  # m; a vertex that comes no farther from the body than this still lies on it
 NEAR = 0.05  # m; cloth that is nearer to the body may be carried by it
 OUTWARD = 0.5  # least cosine between the cloth's normal and the direction away from the body
 UPWARD = 0.6  # least cosine between up and the direction away from the body, where it carries cloth
@@ -88,8 +91,7 @@ def settle(
         pieces = pieces_of(before, placed.faces, [body.vertices], body.faces, clearance or usual.thickness)
     sunk = sinking(before, placed.faces, body.vertices, body.faces, pieces)
     contact = contact_for(before, placed.faces, sunk, clearance, pieces)
-    x = push_out(before, placed.faces, body, contact.thickness)
-    x = bring_apart(x, placed.faces, body, contact.thickness)
+    x = _out_of(body, before, placed.faces, contact.thickness)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
         check_apart(file, placed)  # what else would be told follows from it
@@ -119,39 +121,107 @@ def _away_from(body: BodyRecord, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return distance_and_direction(x, body.vertices, body.faces, border_of(body.faces, len(body.vertices)))
 
 
+def _out_of(body: BodyRecord, x: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
+    """Return vertices (V, 3) out of the body and apart from each other: it gives way, unless that brings it through itself."""
+    starts = [x]
+    if not len(crossing_pairs(x, faces)):  # else its rest shape is no shape to keep
+        starts.insert(0, give_way(x, faces, body, clearance))
+    for start in starts:
+        out = bring_apart(push_out(start, faces, body, clearance), faces, body, clearance)
+        if not len(crossing_pairs(out, faces)):
+            break
+    return out
+
+
+class _Room:
+    """What vertices lack to a clearance (m) from the body, themselves or at the middles of their edges.
+
+    A point is looked at again only where it has moved by more than what it had to spare.
+    """
+
+    def __init__(self, x: np.ndarray, edges: np.ndarray, body: BodyRecord, clearance: float):
+        self.edges, self.body, self.clearance = edges, body, clearance
+        self.seen = with_middles(x, edges)
+        self.distance, self.away = _away_from(body, self.seen)
+
+    def lack(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (V,) each vertex (V, 3) has to go, m, and the unit vectors (V, 3) that lead away from the body."""
+        points, count = with_middles(x, self.edges), len(x)
+        gone = np.linalg.norm(points - self.seen, axis=1)
+        again = np.flatnonzero((gone > 0) & (self.distance - gone < self.clearance))
+        if again.size:
+            self.seen[again] = points[again]
+            self.distance[again], self.away[again] = _away_from(self.body, points[again])
+        lacks = np.maximum(self.clearance - self.distance, 0)
+        short = lacks[:count].copy()
+        np.maximum.at(short, self.edges, lacks[count:, None])
+        return short, self.away[:count]
+
+
+def give_way(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
+    """Return vertices (V, 3) drawn towards the clearance (m) from the body, by which cloth is strained as little as can be.
+
+        min over y, R of   sum_edges |y_j - y_i - (R_i + R_j)/2 (x_j - x_i)|^2 + `FIRM` sum_near n_i |y_i - p_i|^2
+
+    R_i are rotations, n_i the number of edges of a vertex, p_i where it is out of the body; near are those that had to go out
+    and have not left it since. Rounds alternate between y, R and p. Not all comes out: `push_out` ends it. Where it had to be
+    pushed alone, a shirt on a larger chest would be as a bowl there. Source: Sorkine and Alexa 2007, As-rigid-as-possible
+    surface modeling.
+    """
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import splu
+
+    edges, count = topology(faces)[0], len(x)
+    rows = np.arange(len(edges))
+    signs = np.repeat([-1.0, 1.0], len(edges))
+    along = coo_array((signs, (np.tile(rows, 2), edges.T.ravel())), shape=(len(edges), count)).tocsr()  # y_j - y_i
+    ends, degree = abs(along).T.tocsr(), np.maximum(np.bincount(edges.ravel(), minlength=count), 1.0)
+    laplacian, given = (along.T @ along).tocsc(), along @ x
+    room, y, near, goal = _Room(x, edges, body, clearance), x, np.zeros(count, bool), x.copy()
+    for _ in range(YIELDS):
+        short, away = room.lack(y)
+        if short.max() <= 0.01 * clearance:
+            break
+        near = (near & (room.distance[:count] < clearance + SLACK)) | (short > 0)
+        goal[near] = y[near] + short[near, None] * away[near]
+        drawn = FIRM * degree * near
+        solve = splu((laplacian + diags_array(drawn + LOOSE)).tocsc()).solve
+        for _ in range(TURNS):
+            turned = _rotations((ends @ (given[:, :, None] * (along @ y)[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3))
+            wanted = np.einsum("eab,eb->ea", 0.5 * (turned[edges[:, 0]] + turned[edges[:, 1]]), given)
+            y = solve(along.T @ wanted + drawn[:, None] * goal + LOOSE * y)
+    return y
+
+
+def _rotations(moments: np.ndarray) -> np.ndarray:
+    """Return the rotation (V, 3, 3) that comes nearest to each map a -> b, of moments sum a b^T (V, 3, 3)."""
+    u, _, vt = np.linalg.svd(moments)
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    return np.swapaxes(u @ vt, 1, 2)
+
+
 def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
     """Return vertices (V, 3) moved so that they and the middles of edges keep the clearance (m) from the body.
 
     Each round moves a vertex that is too near the body, or that ends an edge whose middle is, away from the body until it is
-    not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth. A point is looked at
-    again only where it has moved by more than what it had to spare.
+    not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth.
     """
     from scipy.sparse import diags_array
 
     edges = topology(faces)[0]
     around = adjacency(edges, len(x))
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
-    held, own = np.zeros(len(x), bool), np.zeros(x.shape)
-    seen = with_middles(x, edges)
-    distance, away = _away_from(body, seen)
+    held, own, room = np.zeros(len(x), bool), np.zeros(x.shape), _Room(x, edges, body, clearance)
     far = FAR * np.ptp(body.vertices, axis=0).max()  # a garment pushed farther is not on the body
     for _ in range(PUSHES):
         moved = own
         for _ in range(RINGS):
             moved = np.where(held[:, None], own, mean @ moved)
-        points = with_middles(x + moved, edges)
-        gone = np.linalg.norm(points - seen, axis=1)
-        again = np.flatnonzero((gone > 0) & (distance - gone < clearance))
-        if again.size:
-            seen[again] = points[again]
-            distance[again], away[again] = _away_from(body, points[again])
-        lacks = np.maximum(clearance - distance, 0)
-        short = lacks[: len(x)].copy()
-        np.maximum.at(short, edges, lacks[len(x) :, None])
+        short, away = room.lack(x + moved)
         if short.max() <= 0.01 * clearance or np.linalg.norm(moved, axis=1).max() > far:
             break
         held |= short > 0
-        own = np.where(held[:, None], moved + short[:, None] * away[: len(x)], 0)
+        own = np.where(held[:, None], moved + short[:, None] * away, 0)
     return x + moved
 
 
