@@ -307,7 +307,7 @@ def _say_strain(found) -> None:
     )
     strain = 100 * np.abs(after / np.maximum(before, 1e-12) - 1)
     mean = np.sqrt(np.mean(strain**2))
-    print(f"  strain    its edges are {mean:.1f} % longer or shorter by that (r.m.s.), {strain.max():.0f} % at most")
+    print(f"            by that its edges are {mean:.1f} % longer or shorter (r.m.s.), {strain.max():.0f} % at most")
     if mean > TIGHT:
         print("            so it was made for a slimmer body: give that one as --from, or a larger --scale")
 
