@@ -25,7 +25,7 @@ from ncs_jax.runs.train import IDLE
 from ncs_jax.scene.model import RitzModes, local_rotations, pose_body
 from ncs_jax.scene.spec import load_scene, scene_from
 from ncs_jax.simulation.implicit_euler import simulate, simulator_from
-from ncs_jax.simulation.ritz_modes import LOOSE, STICK, _sticking, displacement_slopes, softest_ritz_modes, stiffness_in_pose
+from ncs_jax.simulation.ritz_modes import LOOSE, STICK, _sticking, displacement_slopes, softest_ritz_modes, stiffness_in_poses
 from ncs_jax.training.loss import gradients
 from ncs_jax.training.step import Task, initial_state, windows_of
 
@@ -349,7 +349,7 @@ def test_the_stiffness_in_a_pose_is_of_a_garment_that_gives_way(tmp_path):
     stiff = np.asarray(hessian) + np.diag(LOOSE**2 * mass)
     expected = np.linalg.inv(b.T @ np.linalg.solve(stiff, b))
     offsets = np.linalg.solve(blended[:, :, :3], (x - blended[:, :, 3])[..., None])[..., 0] - rest
-    found = stiffness_in_pose(model, track.matrices[0], offsets)
+    (found,) = stiffness_in_poses(model, track.matrices[:1], jnp.asarray(offsets)[..., None])
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * abs(expected).max())
     locked = p.T @ stiff @ p
     assert np.trace(found) < 0.5 * np.trace(locked)

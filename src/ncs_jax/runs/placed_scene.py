@@ -26,6 +26,7 @@ from ncs_jax.prepare.recombination import Recombination, recombination_of, recom
 from ncs_jax.runs.pose_stiffness import find_stiffness, learn_pose_stiffness
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
+from ncs_jax.simulation.ritz_modes import AT_ONCE
 from ncs_jax.training.batches import batches, focused, whole_chunks
 from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch
 from ncs_jax.training.loss import with_bodies
@@ -165,9 +166,9 @@ class PlacedScene:
         return True
 
     def find_stiffness(self, params: dict) -> None:
-        """Do what finding the stiffness in a pose takes, where the garment swings."""
+        """Do what finding the stiffness in `AT_ONCE` poses and one takes, where the garment swings."""
         if isinstance(network := self.assembly.network, Swing):
-            find_stiffness(network, params, self.model, self._bare, np.arange(1))
+            find_stiffness(network, params, self.model, self._bare, np.arange(AT_ONCE + 1) % len(self._bare.start))
 
     def rebuild_lists(self, params: dict) -> None:
         """Tell the searches for the nearest vertex where the garment is now: they find the same, several times as fast."""

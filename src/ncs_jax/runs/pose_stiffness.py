@@ -16,7 +16,7 @@ from ncs_jax.network.methods.swing import Swing
 from ncs_jax.prepare.build import Assembly, swing_range
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, RitzModes
-from ncs_jax.simulation.ritz_modes import displacement_slopes, stiffness_in_pose
+from ncs_jax.simulation.ritz_modes import displacement_slopes, stiffness_in_poses
 
 __all__ = ["find_stiffness", "learn_pose_stiffness", "poses_of"]
 
@@ -36,7 +36,7 @@ def poses_of(steps: int) -> int:
 def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures, steps: int, seed: int) -> Assembly:
     """Return a garment whose swing knows how stiff the garment is in a pose, as the network now has the garment.
 
-    K is found by `stiffness_in_pose` in some poses of the training, see `poses_of`; its Cholesky factor is fitted by ridge
+    K is found by `stiffness_in_poses` in some poses of the training, see `poses_of`; its Cholesky factor is fitted by ridge
     regression on the poses' descriptors, the ridge chosen by leaving each pose out, for `methods.swing.stiffness`. Between what
     was found in the poses it is bounded. What bounds a swing is found anew with it. A network that does not swing, and a
     training too short for that, leave all as it is.
@@ -60,8 +60,7 @@ def learn_pose_stiffness(assembly: Assembly, params: dict, track: MotionFeatures
 
 def find_stiffness(network: Swing, params: dict, model: Model, track: MotionFeatures, frames: np.ndarray) -> np.ndarray:
     """Return K (frames, modes, modes) of some frames about the network's static garment, J."""
-    offsets = np.asarray(_static_offsets(network, params, model, track.static[frames]))
-    return np.stack([stiffness_in_pose(model, track.matrices[t], jnp.asarray(offsets[..., i])) for i, t in enumerate(frames)])
+    return stiffness_in_poses(model, track.matrices[frames], _static_offsets(network, params, model, track.static[frames]))
 
 
 def with_vibrations(assembly: Assembly, vibrations: RitzModes) -> Assembly:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,8 +37,9 @@ from ncs_jax.simulation.solver.problem import (
 from ncs_jax.simulation.solver.stiffness import Couplings, couplings_from
 from ncs_jax.simulation.walk_in import FALL, SETTLE, walk_in
 
-__all__ = ["displacement_slopes", "softest_ritz_modes", "stiffness_in_pose"]
+__all__ = ["AT_ONCE", "displacement_slopes", "softest_ritz_modes", "stiffness_in_poses"]
 
+AT_ONCE = min(4, os.cpu_count() or 1)  # poses, each with a factor of its own in memory
 AMPLITUDE = 0.05  # m: root mean square displacement of the softest direction
 FREE = 5  # steps without friction, until the garment touches the body
 STEPS = 60  # of Newton's method to the drape, at most
@@ -225,7 +228,7 @@ def softest_ritz_modes(model: Model, matrices: Float[Array, "joints 3 4"], count
     from scipy.linalg import eigh
     from scipy.sparse import diags
 
-    still = functools.partial(_still, model, _couplings(model))
+    still = partial(_still, model, _couplings(model))
     problem, transforms = still(matrices)
     mesh, mass = model.garment.mesh, np.asarray(problem.mass, np.float64)
     n, mass = len(mass), np.where(mass > 0, mass, mass.mean())
@@ -257,21 +260,31 @@ def softest_ritz_modes(model: Model, matrices: Float[Array, "joints 3 4"], count
     return RitzModes(*found, drape=_unpose(transforms, x) - _unpose(transforms, worn))  # zeros where a blend is singular
 
 
-def stiffness_in_pose(model: Model, matrices: Array, offsets: Array) -> np.ndarray:
-    """Return how a garment in a pose opposes a displacement along its vibrations when all else of it gives way, J.
+def stiffness_in_poses(
+    model: Model, matrices: Float[Array, "poses joints 3 4"], offsets: Float[Array, "verts 3 poses"]
+) -> Float[np.ndarray, "poses modes modes"]:
+    """Return how a garment in each pose opposes a displacement along its vibrations when all else of it gives way, J.
 
         K = (B^T H^-1 B)^-1,   B = M P G^-1,   G = P^T M P,   P = R D
 
     H is the stiffness there, as Newton's method has it, with what touches the body stuck to it where nothing is pinned. A load
     f on the vibrations moves the garment by y = H^-1 B f, and so by q = B^T y along them: f = K q. P^T H P in its place would
-    be stiffer by far: the drape's vibrations stretch the cloth in other poses.
+    be stiffer by far: the drape's vibrations stretch the cloth in other poses. `AT_ONCE` poses are worked at at once.
 
     Args:
-        model: with vibrations D. matrices: joint transforms (joints, 3, 4). offsets: (verts, 3) of the static garment, m.
+        model: with vibrations D. matrices: joint transforms. offsets: of the static garment, m.
     """
+    one, offsets = partial(_stiffness, model, _couplings(model)), jnp.moveaxis(offsets, -1, 0)
+    first = one(matrices[0], offsets[0])  # which compiles
+    with ThreadPoolExecutor(AT_ONCE) as pool:  # a factorisation keeps only one core busy
+        return np.stack([first, *pool.map(one, matrices[1:], offsets[1:])])
+
+
+def _stiffness(model: Model, couplings: Couplings, matrices: Array, offsets: Array) -> np.ndarray:
+    """The same in one pose."""
     from scipy.sparse import diags
 
-    problem, transforms = _still(model, _couplings(model), matrices)
+    problem, transforms = _still(model, couplings, matrices)
     x = _skin(transforms, model.garment.mesh.rest + offsets)
     free = jnp.zeros((*x.shape, 3), x.dtype)
     _, point, (diagonal, off) = _evaluated(problem, x, free, x)

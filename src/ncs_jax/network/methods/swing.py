@@ -6,7 +6,7 @@ the directions D of `ritz_modes.softest_ritz_modes`, carried by skinning, P_t = 
     (G_t (1 + c h) + h^2 K_t) q_t = -P_t^T M (s_t - 2 x_{t-1} + x_{t-2}) + c h G_t q_{t-1},   G_t = P_t^T M P_t,   x = s + P q
 
 K_t is the stiffness of the pose: what a displacement along the vibrations costs when all else of the garment gives way, see
-`ritz_modes.stiffness_in_pose`. Training finds it about the garment that it has learned, in some poses, and fits it to all by a
+`ritz_modes.stiffness_in_poses`. Training finds it about the garment that it has learned, in some poses, and fits it to all by a
 linear map of the descriptors: `stiffness`. Until then it is that about the drape, E_0 I.
 
 and, where that is beyond the linear range, stops short of it, see `Swing.bounded`. It begins at zero, rings with the garment's
