@@ -158,8 +158,9 @@ def scenes_of(files: Sequence[Path], plain: Scene, body: io.BodyRecord, kept: Pa
             if isinstance(found, InputError):
                 raise found
             cloth = settle(file, found, body)
-            content = hashlib.sha256(file.read_bytes()).hexdigest()
-            own = kept / "fitted" / f"{file.stem}_{named(content, plain.to_dict()['body'], found.options)}.npz"
+            # Named by the mesh that fitting makes, to .01 mm: what is kept is looked up by this name.
+            content = hashlib.sha256(file.read_bytes() + cloth.garment.vertices.round(5).tobytes()).hexdigest()
+            own = kept / "fitted" / f"{file.stem}_{named(content, plain.to_dict()['body'])}.npz"
             own.parent.mkdir(parents=True, exist_ok=True)
             io.write_garment(own, cloth.garment)
         except InputError as error:
