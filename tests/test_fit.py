@@ -16,7 +16,7 @@ from ncs_jax.io.mesh.axes import TURNS
 from ncs_jax.io.mesh.surface import boundary_loops
 from ncs_jax.io.packaged import ASSETS
 from ncs_jax.prepare import garment_placement
-from ncs_jax.prepare.fit import BAND, bring_apart, fit, pins_of, push_out, settle
+from ncs_jax.prepare.fit import BAND, Room, bring_apart, fit, pins_of, push_out, settle
 from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.hanging import RAYS, trunk_of
 from ncs_jax.prepare.wearing import cloth_of, skin_of
@@ -524,7 +524,8 @@ def test_cloth_gives_way_to_the_body_with_little_strain():
     found = place("x.npz", given, body, move=(0.0, 0.0, 0.0), scale=1.0, up="y", turn=0)
     settled = settle("x.npz", found, body)
     assert settled.depth[0].max() > 0.02 and settled.depth[1].max() < -0.0035
-    pushed = push_out(given.vertices.astype(np.float64), given.faces, body, settled.contact.thickness)
+    x = given.vertices.astype(np.float64)
+    pushed = push_out(x, Room(x, given.faces, body, settled.contact.thickness))
     assert np.abs(strain(pushed)).max() > 1
     assert np.abs(strain(settled.garment.vertices)).max() < 0.25
     assert np.sqrt(np.mean(strain(settled.garment.vertices) ** 2)) < 0.04
@@ -533,4 +534,4 @@ def test_cloth_gives_way_to_the_body_with_little_strain():
 def test_cloth_that_is_apart_stays_as_it_is(body):
     garment = sleeve()
     x = garment.vertices.astype(np.float64)
-    assert bring_apart(x, garment.faces, body, 0.004) is x
+    assert bring_apart(x, garment.faces, Room(x, garment.faces, body, 0.004)) is x

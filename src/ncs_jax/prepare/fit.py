@@ -21,7 +21,7 @@ from ncs_jax.prepare.garment_placement import place
 from ncs_jax.prepare.placement import Placement
 from ncs_jax.scene.spec import CollisionSpec
 
-__all__ = ["PINS", "Fitted", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
+__all__ = ["PINS", "Fitted", "Room", "bring_apart", "check_length", "fit", "pins_of", "push_out", "settle"]
 
 PINS = "pins"  # the vertex group that is written
 TRIES = 12  # of bringing cloth apart
@@ -91,7 +91,9 @@ def settle(
         pieces = pieces_of(before, placed.faces, [body.vertices], body.faces, clearance or usual.thickness)
     sunk = sinking(before, placed.faces, body.vertices, body.faces, pieces)
     contact = contact_for(before, placed.faces, sunk, clearance, pieces)
-    x = _out_of(body, before, placed.faces, contact.thickness)
+    room = Room(before, placed.faces, body, contact.thickness)
+    inside = -room.distance[: len(before)].copy()
+    x = _out_of(before, placed.faces, room)
     farthest = float(np.linalg.norm(x - before, axis=1).max())
     if farthest > FAR * np.ptp(body.vertices, axis=0).max():
         check_apart(file, placed)  # what else would be told follows from it
@@ -109,8 +111,7 @@ def settle(
     groups = (
         placed.groups if own else {n: g for n, g in placed.groups.items() if n != PINS} | ({PINS: held} if len(held) else {})
     )
-    depth = -_away_from(body, before)[0], -away[0]
-    return Fitted(replace(placed, groups=groups), placement, depth, carried, straps and not own, contact)
+    return Fitted(replace(placed, groups=groups), placement, (inside, -away[0]), carried, straps and not own, contact)
 
 
 # --- out of the body ------------------------------------------------------------------------------------------------
@@ -121,27 +122,15 @@ def _away_from(body: BodyRecord, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return distance_and_direction(x, body.vertices, body.faces, border_of(body.faces, len(body.vertices)))
 
 
-def _out_of(body: BodyRecord, x: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
-    """Return vertices (V, 3) out of the body and apart from each other: it gives way, unless that brings it through itself."""
-    starts = [x]
-    if not len(crossing_pairs(x, faces)):  # else its rest shape is no shape to keep
-        starts.insert(0, give_way(x, faces, body, clearance))
-    for start in starts:
-        out = bring_apart(push_out(start, faces, body, clearance), faces, body, clearance)
-        if not len(crossing_pairs(out, faces)):
-            break
-    return out
-
-
-class _Room:
+class Room:
     """What vertices lack to a clearance (m) from the body, themselves or at the middles of their edges.
 
     A point is looked at again only where it has moved by more than what it had to spare.
     """
 
-    def __init__(self, x: np.ndarray, edges: np.ndarray, body: BodyRecord, clearance: float):
-        self.edges, self.body, self.clearance = edges, body, clearance
-        self.seen = with_middles(x, edges)
+    def __init__(self, x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float):
+        self.edges, self.body, self.clearance = topology(faces)[0], body, clearance
+        self.seen = with_middles(x, self.edges)
         self.distance, self.away = _away_from(body, self.seen)
 
     def lack(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,8 +147,21 @@ class _Room:
         return short, self.away[:count]
 
 
-def give_way(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
-    """Return vertices (V, 3) drawn towards the clearance (m) from the body, by which cloth is strained as little as can be.
+def _out_of(x: np.ndarray, faces: np.ndarray, room: Room) -> np.ndarray:
+    """Return vertices (V, 3) out of the body and apart from each other: it gives way, unless that brings it through itself."""
+    starts = [x]
+    if not len(crossing_pairs(x, faces)):  # else its rest shape is no shape to keep
+        starts.insert(0, give_way(x, room))
+    for start in starts:
+        out = push_out(start, room)
+        apart = bring_apart(out, faces, room)
+        if apart is not None:
+            return apart
+    return out
+
+
+def give_way(x: np.ndarray, room: Room) -> np.ndarray:
+    """Return vertices (V, 3) drawn towards the clearance from the body, by which cloth is strained as little as can be.
 
         min over y, R of   sum_edges |y_j - y_i - (R_i + R_j)/2 (x_j - x_i)|^2 + `FIRM` sum_near n_i |y_i - p_i|^2
 
@@ -171,18 +173,18 @@ def give_way(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: floa
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import splu
 
-    edges, count = topology(faces)[0], len(x)
+    edges, count = room.edges, len(x)
     rows = np.arange(len(edges))
     signs = np.repeat([-1.0, 1.0], len(edges))
     along = coo_array((signs, (np.tile(rows, 2), edges.T.ravel())), shape=(len(edges), count)).tocsr()  # y_j - y_i
     ends, degree = abs(along).T.tocsr(), np.maximum(np.bincount(edges.ravel(), minlength=count), 1.0)
     laplacian, given = (along.T @ along).tocsc(), along @ x
-    room, y, near, goal = _Room(x, edges, body, clearance), x, np.zeros(count, bool), x.copy()
+    y, near, goal = x, np.zeros(count, bool), x.copy()
     for _ in range(YIELDS):
         short, away = room.lack(y)
-        if short.max() <= 0.01 * clearance:
+        if short.max() <= 0.01 * room.clearance:
             break
-        near = (near & (room.distance[:count] < clearance + SLACK)) | (short > 0)
+        near = (near & (room.distance[:count] < room.clearance + SLACK)) | (short > 0)
         goal[near] = y[near] + short[near, None] * away[near]
         drawn = FIRM * degree * near
         solve = splu((laplacian + diags_array(drawn + LOOSE)).tocsc()).solve
@@ -200,43 +202,42 @@ def _rotations(moments: np.ndarray) -> np.ndarray:
     return np.swapaxes(u @ vt, 1, 2)
 
 
-def push_out(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
-    """Return vertices (V, 3) moved so that they and the middles of edges keep the clearance (m) from the body.
+def push_out(x: np.ndarray, room: Room) -> np.ndarray:
+    """Return vertices (V, 3) moved so that they and the middles of edges keep the clearance from the body.
 
     Each round moves a vertex that is too near the body, or that ends an edge whose middle is, away from the body until it is
     not. The `RINGS` rings of vertices around it follow part of the way, so that the cloth stays smooth.
     """
     from scipy.sparse import diags_array
 
-    edges = topology(faces)[0]
-    around = adjacency(edges, len(x))
+    around = adjacency(room.edges, len(x))
     mean = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around
-    held, own, room = np.zeros(len(x), bool), np.zeros(x.shape), _Room(x, edges, body, clearance)
-    far = FAR * np.ptp(body.vertices, axis=0).max()  # a garment pushed farther is not on the body
+    held, own = np.zeros(len(x), bool), np.zeros(x.shape)
+    far = FAR * np.ptp(room.body.vertices, axis=0).max()  # a garment pushed farther is not on the body
     for _ in range(PUSHES):
         moved = own
         for _ in range(RINGS):
             moved = np.where(held[:, None], own, mean @ moved)
         short, away = room.lack(x + moved)
-        if short.max() <= 0.01 * clearance or np.linalg.norm(moved, axis=1).max() > far:
+        if short.max() <= 0.01 * room.clearance or np.linalg.norm(moved, axis=1).max() > far:
             break
         held |= short > 0
         own = np.where(held[:, None], moved + short[:, None] * away, 0)
     return x + moved
 
 
-def bring_apart(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: float) -> np.ndarray:
+def bring_apart(x: np.ndarray, faces: np.ndarray, room: Room) -> np.ndarray | None:
     """Return vertices (V, 3) where cloth that passes through itself a little is smoothed until it does not.
 
     Each of `TRIES` rounds moves the vertices of such triangles and the rings around them to the mean of their neighbours, and
-    then out of the body. Where none helps, whole parts are on each other's wrong side: it is returned as it was.
+    then out of the body. Where none helps, whole parts are on each other's wrong side, and None is returned.
     """
     from scipy.sparse import diags_array
 
     found = crossing_pairs(x, faces)
     if not len(found):
         return x
-    around = adjacency(topology(faces)[0], len(x))
+    around = adjacency(room.edges, len(x))
     mean, moved = diags_array(1 / np.maximum(around.sum(axis=1), 1)) @ around, x
     for _ in range(TRIES):
         near = np.zeros(len(x))
@@ -245,11 +246,11 @@ def bring_apart(x: np.ndarray, faces: np.ndarray, body: BodyRecord, clearance: f
             near = np.maximum(near, (around @ near) > 0)
         for _ in range(RINGS // 2):
             moved = np.where(near[:, None] > 0, mean @ moved, moved)
-        moved = push_out(moved, faces, body, clearance)
+        moved = push_out(moved, room)
         found = crossing_pairs(moved, faces)
         if not len(found):
             return moved
-    return x
+    return None
 
 
 # --- pins -----------------------------------------------------------------------------------------------------------
