@@ -7,7 +7,21 @@ import pytest
 
 from ncs_jax import io
 from ncs_jax.errors import InputError
-from ncs_jax.metrics.coverage import FAR, KEPT, STRAINED, TOLD, _nearest, coverage, trained_motion
+from ncs_jax.metrics.coverage import (
+    CLOSE,
+    FAR,
+    KEPT,
+    STRAINED,
+    STRAINS,
+    TOLD,
+    _described,
+    _nearest,
+    _nearest_frame,
+    coverage,
+    spread_frames,
+    trained_motion,
+    with_strain,
+)
 from ncs_jax.prepare.build import features_from_records
 from ncs_jax.runs.checkpoint import read_trained, write_trained
 from ncs_jax.runs.run import Run
@@ -79,15 +93,46 @@ def test_speeds_beyond_count_where_a_network_reads_them(known):
 def test_cloth_strained_more_than_in_training_is_told_whatever_the_pose(known):
     """Its energy is quadratic: at `STRAINED` times it is a tenth above; where the strain is known, it decides."""
     assembly, trained = known
-    assert seen(trained, assembly, record(), strain=3.0).strain == 0  # a run of an earlier version has none to compare with
+    assert seen(trained, assembly, record(), strain=np.full(60, 3.0)).strain == 0  # an earlier version has none to compare with
     trained = replace(trained, strain=1.5)
     for ratio, told in ((0.8, False), (STRAINED - 0.01, False), (STRAINED + 0.01, True)):
-        found = seen(trained, assembly, record(), strain=1.5 * ratio)
+        found = seen(trained, assembly, record(), strain=np.full(60, 1.5 * ratio))
         assert found.strain == pytest.approx(ratio) and found.told == told and not found.outside.any()
     assert found.excess == pytest.approx(TOLD, rel=0.05) and found.facts()["strain"] == round(STRAINED + 0.01, 3)
     assert "near the poses" in str(found) and "strained 1.5 times as much as on these; adapt it" in str(found)
-    far = seen(trained, assembly, record(size=1.3), strain=1.5)
+    far = seen(trained, assembly, record(size=1.3), strain=np.full(60, 1.5))
     assert far.outside.any() and far.excess == 0 and not far.told and "strained" not in str(far)
+
+
+def test_a_frame_near_a_trained_one_is_compared_with_that_one_and_others_with_the_mean(known):
+    """So a motion that was trained on is not told for straining more than calm ones, nor another for a calm one being near."""
+    assembly, trained = known
+    track = features_from_records(assembly.model, record())
+    frames = spread_frames(assembly.model, track, np.arange(60))
+    assert len(set(frames)) == len(frames) > 10
+    strain = 0.5 + 8 * np.abs(record().poses[:, 1, 0])  # of the pose
+    trained = with_strain(trained, assembly.model, track, frames, strain[frames], 1.0)
+    assert trained.frame_radius < CLOSE
+    again = seen(trained, assembly, record(), strain=strain)
+    lowest = strain.mean() / np.maximum(strain, 1).mean()  # those below the mean are compared with the mean
+    assert again.strain == pytest.approx(lowest, abs=0.1) and not again.told
+    assert seen(trained, assembly, record(), strain=strain[::7], every=7).strain == pytest.approx(again.strain, abs=0.1)
+    assert seen(trained, assembly, record(), strain=2 * strain).told
+    far = replace(record(), poses=record().poses + np.array([0, 0, 1.5]))
+    assert seen(trained, assembly, far, strain=strain).strain == pytest.approx(strain.mean())
+
+
+def test_few_frames_are_kept_of_many_motions(known, rng):
+    assembly, trained = known
+    poses = rng.normal(size=(3000, 2, 3)).astype(np.float32)
+    track = features_from_records(assembly.model, replace(record(), poses=poses, translation=np.zeros((3000, 3), np.float32)))
+    frames = spread_frames(assembly.model, track, np.arange(1000, 3000))
+    assert len(frames) == STRAINS and frames.min() >= 1000
+    kept = with_strain(trained, assembly.model, track, frames, np.ones(len(frames)), 1.0)
+    far, which = _nearest_frame(_described(assembly.model, track)[0], kept.frames)
+    away = np.linalg.norm(_described(assembly.model, track)[0][:, None] - kept.frames.astype(float), axis=-1).max(axis=-1)
+    assert np.allclose(far, away.min(axis=1), atol=5e-3) and np.allclose(away[np.arange(3000), which], far, atol=5e-3)
+    assert np.isclose(np.mean(far <= kept.frame_radius), 0.95, atol=0.001)
 
 
 def test_few_poses_are_kept_and_every_trained_one_is_near_one(known, rng):
@@ -113,11 +158,20 @@ def test_it_is_kept_and_found_again_where_it_was_not(known, tmp_path):
     write_trained(tmp_path, trained)
     back = read_trained(tmp_path)
     assert all(np.array_equal(a, b) for a, b in zip(vars(back).values(), vars(trained).values(), strict=True))
-    write_trained(tmp_path, replace(trained, strain=1.25))
-    assert read_trained(tmp_path).strain == 1.25
-    earlier = {name: value for name, value in vars(trained).items() if name != "strain"}
-    np.savez(tmp_path / "trained.npz", **earlier)
-    assert read_trained(tmp_path).strain == 0
+    whole = with_strain(
+        trained, assembly.model, features_from_records(assembly.model, record()), np.arange(3), np.ones(3), 1.25
+    )
+    write_trained(tmp_path, whole)
+    back = read_trained(tmp_path)
+    assert back.strain == 1.25 and all(
+        np.array_equal(a, b) for a, b in zip(vars(back).values(), vars(whole).values(), strict=True)
+    )
+    for lacking in (["frames", "frame_strain", "frame_radius"], ["strain", "frames", "frame_strain", "frame_radius"]):
+        np.savez(tmp_path / "trained.npz", **{name: value for name, value in vars(whole).items() if name not in lacking})
+        back = read_trained(tmp_path)  # of earlier versions
+        assert back.strain == (0 if "strain" in lacking else 1.25)
+        ratio = seen(back, assembly, record(), strain=np.full(60, 2.5)).strain
+        assert ratio == (0 if "strain" in lacking else pytest.approx(2))
     (tmp_path / "trained.npz").write_bytes((tmp_path / "trained.npz").read_bytes()[:200])
     with pytest.raises(InputError, match=r"trained\.npz"):
         read_trained(tmp_path)

@@ -170,7 +170,8 @@ def test_energy_falls(plain_jax):
     assert int(state.dropped) == 0 and int(state.step) == 60
     look = jax.jit(lambda *given: training_metrics(assembly.model, assembly.network, spec.window, *given))
     seen = look(state.params, assembly.track, ends[-1])
-    assert 0 <= float(seen["strain"]) < 20 and 0 <= float(seen["penetrating"]) <= 100
+    assert np.all((seen["strain"] >= 0) & (seen["strain"] < 20)) and seen["strain"].shape == ends[-1].shape
+    assert 0 <= float(seen["penetrating"]) <= 100
 
 
 def test_a_step_that_is_not_finite_is_dropped_counted_and_named(plain_jax):

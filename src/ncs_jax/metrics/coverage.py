@@ -2,12 +2,13 @@
 
 A network is at the energy of a simulation where it was trained. Beyond, its energy rises with the distance of the pose: see
 `FAR`. How steeply depends on garment and training; how much more it strains the cloth than there tells it for each: `STRAINED`.
+Motions strain it unequally: a frame near a trained one is compared with that one, others with the mean of all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
-__all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "trained_motion"]
+__all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "spread_frames", "trained_motion", "with_strain"]
 
 FAR = 0.2  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
 FAST = 2.0  # times the largest trained rate, and twice as much of the accelerations, are the limit
@@ -24,6 +25,7 @@ STRAINED = 1.5  # times the mean strain of trained motions, at which the energy 
 TOLD = 0.1  # of the energy, above which a motion is told to be beyond
 CARRIED = 0.005  # of the garment, that a joint and those below it carry at least, if it counts
 KEPT = 1024  # poses of a joint, at most
+STRAINS = 320  # frames of which the strain is kept, at most
 CLOSE = 0.03  # distance within which every trained pose of a joint has a kept one, if there are no more than `KEPT`
 SEEN = 8192  # frames that are looked at, at most
 STILL = 0.1, 0.5  # 1/s, m/s^2: least limits of rates and accelerations
@@ -41,6 +43,8 @@ class TrainedMotion:
         radius: (joints,) how far 19 of 20 trained poses are from the nearest kept one, at most.
         rates: (joints,) the largest rate of such a pose, 1/s. accelerations: (joints,) of each joint, m/s^2.
         strain: the mean of its edges' strain over these motions, %, once trained; 0 where nobody knows.
+        frames, frame_strain: (strains, joints, 9), (strains,) whole poses far from each other, and the strain in each, %.
+        frame_radius: how far 19 of 20 trained frames are from the nearest of these, at most, by the joint that is farthest.
     """
 
     poses: Float[np.ndarray, "kept 9"]
@@ -49,6 +53,9 @@ class TrainedMotion:
     rates: Float[np.ndarray, "joints"]
     accelerations: Float[np.ndarray, "joints"]
     strain: float = 0.0
+    frames: Float[np.ndarray, "strains joints 9"] = field(default_factory=lambda: np.zeros((0, 0, 9)))
+    frame_strain: Float[np.ndarray, "strains"] = field(default_factory=lambda: np.zeros(0))
+    frame_radius: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,7 @@ class Coverage:
     Attributes:
         poses, speeds: (frames, joints) distance of each joint's pose and speed as a share of the limit: 1 is at the limit.
         joints: their names.
-        strain: the garment's mean strain over that on the motions that it was trained on; 0 where nobody knows.
+        strain: the garment's mean strain over that which its training lets expect; 0 where nobody knows.
     """
 
     poses: Float[np.ndarray, "frames joints"]
@@ -130,11 +137,28 @@ def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
     poses, rates, accelerations = _described(model, track)
     joints = range(poses.shape[1])
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), SEEN)).astype(int))
-    spread = [_spread(poses[some, j]) for j in joints]
+    spread = [_spread(poses[some, j], KEPT) for j in joints]
     kept = np.concatenate([poses[some[chosen], j] for j, (chosen, _) in zip(joints, spread, strict=True)])
     joint = np.repeat(np.array(joints, np.int16), [len(chosen) for chosen, _ in spread])
     radius = np.array([np.percentile(far, 95) for _, far in spread])
     return TrainedMotion(kept.astype(np.float16), joint, radius, rates.max(axis=0), accelerations.max(axis=0))
+
+
+def spread_frames(model: Model, track: MotionFeatures, among: np.ndarray) -> np.ndarray:
+    """Return the numbers of frames of a track that are far from each other, `STRAINS` at most `among` those given."""
+    poses = _described(model, track)[0]
+    some = among[np.unique(np.linspace(0, len(among) - 1, min(len(among), SEEN)).astype(int))]
+    return some[_spread(poses[some].reshape(len(some), -1), STRAINS)[0]]
+
+
+def with_strain(
+    trained: TrainedMotion, model: Model, track: MotionFeatures, frames: np.ndarray, strain: np.ndarray, mean: float
+) -> TrainedMotion:
+    """Return it with the strain, %, that the trained garment has in some frames of a track, and its mean over all of them."""
+    poses = _described(model, track)[0]
+    kept = poses[frames].astype(np.float16)
+    radius = float(np.percentile(_nearest_frame(poses, kept)[0], 95))
+    return replace(trained, strain=mean, frames=kept, frame_strain=strain.astype(np.float32), frame_radius=radius)
 
 
 def coverage(
@@ -144,16 +168,22 @@ def coverage(
     *,
     names: Sequence[str] = (),
     moving: bool = True,
-    strain: float = 0.0,
+    strain: np.ndarray | None = None,
+    every: int = 1,
 ) -> Coverage:
     """Return how far the frames of a track are from what a run was trained on.
 
     For each joint it is the distance |d_t - d_k| to the nearest kept pose, less how far trained ones are, over `FAR`, and its
-    rate and acceleration over the largest trained ones, times `FAST` and twice that.
+    rate and acceleration over the largest trained ones, times `FAST` and twice that. The strain that training lets expect is
+
+        `e_t = mean + max(1 - far_t / FAR, 0) max(s_k - mean, 0)`
+
+    s_k that of the nearest kept frame, far_t how far its farthest joint is less how far that of trained frames is. So a motion
+    that was trained on is not told for being strained more than others, and none for being so by calm ones.
 
     Args:
         names: of the body's joints; their numbers where there are none. moving: whether the network reads speeds at all.
-        strain: mean over the track's frames of the garment's, %, as the network has it; 0 where nobody knows.
+        strain: (frames / every,) that of the garment in every so many frames, %, as the network has it; None: nobody knows.
     """
     poses, rates, accelerations = _described(model, track)
     far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1)
@@ -162,7 +192,17 @@ def coverage(
     fast = np.maximum(fast, accelerations / np.maximum(2 * FAST * trained.accelerations, STILL[1]))
     numbers = [model.source_joints[j] for j in _carrying(model)]
     called = tuple(names[n] if names else str(n) for n in numbers)
-    return Coverage(far, fast if moving else np.zeros_like(far), called, strain / trained.strain if trained.strain else 0.0)
+    ratio = 0.0 if strain is None or not trained.strain else float(np.mean(strain) / _expected(trained, poses[::every]).mean())
+    return Coverage(far, fast if moving else np.zeros_like(far), called, ratio)
+
+
+def _expected(trained: TrainedMotion, poses: np.ndarray) -> np.ndarray:
+    """Return the strain e_t of `coverage` in poses (frames, joints, 9), %."""
+    if not len(trained.frames):  # a run of an earlier version
+        return np.full(len(poses), trained.strain)
+    far, nearest = _nearest_frame(poses, trained.frames)
+    near = np.maximum(1 - np.maximum(far - trained.frame_radius, 0) / FAR, 0)
+    return trained.strain + near * np.maximum(trained.frame_strain[nearest] - trained.strain, 0)
 
 
 def _carrying(model: Model) -> np.ndarray:
@@ -200,17 +240,17 @@ def _described(model: Model, track: MotionFeatures) -> tuple[np.ndarray, np.ndar
     return poses, rates, accelerations
 
 
-def _spread(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of poses (frames, 9) that are far from each other, and how far each pose is from the nearest of them.
+def _spread(poses: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of poses (frames, any) that are far from each other, and how far each is from the nearest of them.
 
-    Each in turn is the one that is farthest from those before.
+    Each in turn is the one that is farthest from those before, `count` at most.
     """
     columns = np.ascontiguousarray(poses.T, np.float32)
     chosen, far = [0], np.full(len(poses), np.inf, np.float32)
     while True:
         away = columns - columns[:, chosen[-1], None]
         np.minimum(far, np.einsum("it,it->t", away, away), out=far)
-        if far.max() <= CLOSE**2 or len(chosen) == KEPT:
+        if far.max() <= CLOSE**2 or len(chosen) == count:
             return np.array(chosen), np.sqrt(far)
         chosen.append(int(far.argmax()))
 
@@ -220,3 +260,17 @@ def _nearest(poses: np.ndarray, kept: np.ndarray) -> np.ndarray:
     kept = kept.astype(np.float64)
     parts = np.split(poses, range(BLOCK, len(poses), BLOCK))
     return np.concatenate([np.linalg.norm(part[:, None] - kept, axis=-1).min(axis=1) for part in parts])
+
+
+def _nearest_frame(poses: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the farthest joint of each pose (frames, joints, 9) is from the nearest kept pose, and which that is."""
+    kept, far, which = kept.astype(np.float32), [], []
+    for part in np.split(poses.astype(np.float32), range(BLOCK, len(poses), BLOCK)):
+        away = np.zeros((len(part), len(kept)), np.float32)
+        for joint in range(poses.shape[1]):
+            a, b = part[:, joint], kept[:, joint]
+            square = (a * a).sum(1)[:, None] - 2 * a @ b.T + (b * b).sum(1)
+            np.maximum(away, square, out=away)
+        which.append(away.argmin(axis=1))
+        far.append(np.sqrt(away.min(axis=1)))
+    return np.concatenate(far), np.concatenate(which)

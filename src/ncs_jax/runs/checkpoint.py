@@ -142,13 +142,13 @@ def read_trained(run: Path) -> TrainedMotion | None:
     Raises:
         InputError: it is damaged.
     """
-    path, names = Path(run) / "trained.npz", [f.name for f in dataclasses.fields(TrainedMotion)]
+    path, fields = Path(run) / "trained.npz", dataclasses.fields(TrainedMotion)
     if not path.exists():
         return None
-    table = read_npz(path, names.__contains__)
-    strain = float(table.array("strain")) if "strain" in table else 0.0  # of an earlier version
-    poses, joint, radius, rates, accelerations = (table.array(name) for name in names[:-1])
-    return TrainedMotion(poses, joint, radius, rates, accelerations, strain)
+    table = read_npz(path, {f.name for f in fields}.__contains__)
+    later = {"strain", "frames", "frame_strain", "frame_radius"}  # than the first version
+    known: dict[str, Any] = {f.name: table.array(f.name)[()] for f in fields if f.name in table or f.name not in later}
+    return TrainedMotion(**known)
 
 
 class Checkpoints:

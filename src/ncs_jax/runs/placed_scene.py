@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.errors import required
 from ncs_jax.io.records import MotionRecord
+from ncs_jax.metrics.coverage import TrainedMotion, spread_frames, with_strain
 from ncs_jax.network.methods.method import Method
 from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animate
@@ -38,7 +39,7 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
-TIMES = 40  # times as many, of which the mean strain is taken at the end
+MEAN = 160  # frames, of which the mean strain is taken at the end
 POOL = 512  # poses put together of the motions' limbs, others after every checkpoint, where a scene trains on any
 FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
@@ -101,18 +102,27 @@ class PlacedScene:
 
     def measure(self, params: dict, done: int) -> dict[str, float]:
         """Return `training_metrics` of a few frames of the last of the `done` steps."""
-        return self._measured(params, self._ends(done - 1, 1)[0, :SEEN])
+        return {
+            name: float(np.mean(value)) for name, value in self._measured(params, self._ends(done - 1, 1)[0, :SEEN]).items()
+        }
 
-    def strain(self, params: dict) -> float:
-        """Return the mean strain of the garment on the motions that are trained on, %, of frames evenly spread."""
+    def with_strain(self, trained: TrainedMotion, params: dict) -> TrainedMotion:
+        """Return what is known of the motions that are trained on, with how much they strain the garment."""
+        even = self._last[np.linspace(0, len(self._last) - 1, MEAN).astype(int)]
+        frames = spread_frames(self.model, self._motions, self._last)
+        mean = float(self._strain(params, even).mean())
+        return with_strain(trained, self.model, self._motions, frames, self._strain(params, frames), mean)
+
+    def _strain(self, params: dict, frames: np.ndarray) -> np.ndarray:
+        """Return the garment's mean strain in each of these frames, %."""
         count = len(self._ends(0, 1)[0, :SEEN])  # of which the program is
-        ends = self._last[np.linspace(0, len(self._last) - 1, count * TIMES).astype(int)].astype(np.int32)
-        return float(np.mean([self._measured(params, few)["strain"] for few in np.split(ends, TIMES)]))
+        parts = np.pad(frames, (0, -len(frames) % count), mode="edge").astype(np.int32).reshape(-1, count)
+        return np.concatenate([self._measured(params, few)["strain"] for few in parts])[: len(frames)]
 
-    def _measured(self, params: dict, ends) -> dict[str, float]:
+    def _measured(self, params: dict, ends) -> dict[str, np.ndarray]:
         arguments = self.model, params, self.features, ends
         program = self._programs.ready("metrics", self._metrics, *arguments)
-        return {k: float(v) for k, v in program(*jax.tree.leaves(arguments)).items()}
+        return {name: np.asarray(value) for name, value in program(*jax.tree.leaves(arguments)).items()}
 
     def diagnose(self, state: TrainState) -> str:
         """Return why the last dropped step was dropped."""

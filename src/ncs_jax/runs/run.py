@@ -193,11 +193,12 @@ class Run:
         a, trained = self.assembly, self.known()
         if trained is None:
             return None
-        names, track, strain = a.body.joint_names if a.body is not None else (), self.track(motion), 0.0
+        names, track, strain, every = a.body.joint_names if a.body is not None else (), self.track(motion), None, 1
         if trained.strain:
             x = self.animate(track) if vertices is None else vertices
-            strain = float(measure_on_host(a.model, x[:: -(-len(x) // ASKED)])["strain_mean"].mean())
-        return coverage(trained, a.model, track, names=names, moving=a.network.state > 0, strain=strain)
+            every = -(-len(x) // ASKED)
+            strain = measure_on_host(a.model, x[::every])["strain_mean"]
+        return coverage(trained, a.model, track, names=names, moving=a.network.state > 0, strain=strain, every=every)
 
     def known(self) -> TrainedMotion | None:
         """Return what the run was trained on, found again from the motions of its scene where it was not kept."""

@@ -314,7 +314,7 @@ class _Loop:
             last = placed.diagnose(placed.local(self._state))
             warnings.warn(f"{what}: nothing was learned in them; the last one: {last}", InputWarning, stacklevel=4)
         params = placed.local(self._state.params)
-        trained = replace(trained, strain=placed.strain(params))
+        trained = placed.with_strain(trained, params)
         self._output.write_motion(trained)
         return Run(placed.assembly, params, self._steps, trained=trained)
 

@@ -26,8 +26,8 @@ __all__ = ["contact_energies", "diagnose", "training_metrics"]
 
 def training_metrics(
     model: Model, network: Method, window: int, params, track: MotionFeatures, ends
-) -> dict[str, Float[Array, ""]]:
-    """Return mean edge strain and share of penetrating vertices (by the scene's own query), in %, of a few frames.
+) -> dict[str, Float[Array, "..."]]:
+    """Return mean edge strain of each of a few frames, and the penetrating share of vertices (by the scene's own query), in %.
 
     Where alpha scales anything also `moved`: how far alpha = 1 is from alpha = 0, mean over the vertices in mm. With a
     swing also `swung`: how far that is by itself.
@@ -50,7 +50,7 @@ def training_metrics(
         return result
 
     each = (jnp.moveaxis(offsets, -1, 0), track.matrices[ends])
-    found = {k: jnp.mean(v) for k, v in lax.map(one, each).items()}
+    found = {k: v if k == "strain" else jnp.mean(v) for k, v in lax.map(one, each).items()}
     if codes.dynamic is not None:
         moved = offsets - decode(network, params, model, codes.static[-1])
         found["moved"] = 1000 * jnp.mean(norm(jnp.moveaxis(moved, 1, -1)))
