@@ -10,10 +10,13 @@ import jax
 import numpy as np
 import pytest
 
+from ncs_jax.errors import InputError
 from ncs_jax.prepare.build import TrainingMotions, features_from_records
 from ncs_jax.runs.placed_scene import PlacedScene
 from ncs_jax.runs.train import train
 from ncs_jax.training import shares
+from ncs_jax.training.devices import check_fits
+from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.shares import shares_of
 
 from .ready import assembled
@@ -118,6 +121,27 @@ def test_training_takes_one_share_after_another_whenever_it_begins(many, plain_j
     at = later._pieces[0].stop - later._pieces[0].first
     mirrored = ", mirrored" if piece.motion else ""  # the scene names one file
     assert later._named(at + 2) == f" (that is frame {piece.first + 2} of {many.scene.motion.files[0]}{mirrored})"
+
+
+def test_bodies_are_posed_when_compiling_has_given_back_what_it_took(many, plain_jax, monkeypatch):
+    placed = PlacedScene(many, 0)
+    state, every = placed.initial_state(), placed._every
+    placed.refresh(state.params, 0)
+    placed.compile(state, 10)
+    assert placed._everywhere is None
+    program = placed._compiled[10]
+    size = program.memory_analysis()
+    besides = size.temp_size_in_bytes + size.output_size_in_bytes - size.alias_size_in_bytes
+    monkeypatch.setattr("ncs_jax.training.devices.free_memory", lambda: besides)
+    check_fits(program, 4)
+    with pytest.raises(InputError, match="does not fit into memory"):
+        check_fits(program, 4, there=size.argument_size_in_bytes - 1)
+    state, _ = placed.run_chunk(state, 0, 10, 10)
+    assert list(placed._compiled.values()) == [program]
+    (_, features), anew = placed._everywhere, with_bodies(many.model, placed.features, 4).bodies
+    np.testing.assert_array_equal(features.bodies, anew)
+    placed.refresh(state.params, every)  # from now on at once: what a refresh takes is measured
+    assert not np.array_equal(placed._everywhere[1].bodies, anew)
 
 
 def test_resumed_between_two_shares_a_run_is_that_which_went_through(small, tmp_path, plain_jax):

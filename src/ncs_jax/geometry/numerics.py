@@ -57,13 +57,13 @@ def norm(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     return jnp.where(singular, 0, jnp.sqrt(jnp.where(singular, 1, square)))
 
 
-def normalize(x: Float[Array, "*rows n"]) -> Float[Array, "*rows n"]:
-    """Return the unit vector along the last axis; zero with zero derivatives where the row vanishes."""
+def normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
+    """Return the unit vector along an axis; zero with zero derivatives where the row vanishes."""
     # A direction does not depend on scale, so the scale is a constant to the derivative, and no power of it leaves the range.
-    size = lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
+    size = lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
     singular = size < least_length(x.dtype)
     x = jnp.where(singular, 1, x) / jnp.where(singular, 1, size)
-    return jnp.where(singular, 0, x * jnp.sum(x * x, axis=-1, keepdims=True) ** -0.5)
+    return jnp.where(singular, 0, x * jnp.sum(x * x, axis=axis, keepdims=True) ** -0.5)
 
 
 def signed_angle(sine: Float[Array, "*rows"], cosine: Float[Array, "*rows"]) -> Float[Array, "*rows"]:

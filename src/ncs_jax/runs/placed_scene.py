@@ -29,7 +29,7 @@ from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model, pose_body
 from ncs_jax.simulation.ritz_modes import AT_ONCE
 from ncs_jax.training.batches import batches, focused, whole_chunks
-from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch
+from ncs_jax.training.devices import batch_mesh, check_fits, local, replicate, shard_batch, trim_memory
 from ncs_jax.training.loss import with_bodies
 from ncs_jax.training.metrics import contact_energies, diagnose, training_metrics
 from ncs_jax.training.programs import Programs
@@ -63,7 +63,8 @@ class PlacedScene:
         self._recombination = _recombination(assembly)
         self._motions: MotionFeatures  # without poses that are no motion's
         self.features: MotionFeatures
-        self._everywhere: Any  # the model and the features, with bodies
+        self._everywhere: Any = None  # the model and the features, with bodies; None until they are needed
+        self._known: tuple[Array | None, int] = None, 0  # bodies of before, and of how many frames they are those of now
         self._show(0)
 
     @property
@@ -88,16 +89,30 @@ class PlacedScene:
         return local(self.mesh, tree)
 
     def compile(self, state: TrainState, count: int) -> None:
-        """Compile the program of a chunk of `count` steps.
+        """Compile the program of a chunk of `count` steps, and give back the memory that this took, before bodies take some.
 
         Raises:
             InputError: it does not fit into memory.
         """
-        self._ready(self._arguments(self.copied(state), 0, count, 0))
+        batch, structures = self.assembly.scene.training.batch, []
+
+        def shapes(state: TrainState, model: Model, track: MotionFeatures) -> list[Array]:
+            leaves, structure = jax.tree.flatten((state, *self._indices(0, count), 0, model, with_bodies(model, track, batch)))
+            structures.append(structure)
+            return leaves
+
+        if self.mesh is None:
+            leaves = jax.eval_shape(shapes, state, self.model, self.features)
+            self._compiled[count] = self._programs.begin("chunk", self._chunk, leaves, structures[0], reused=True).result()
+            there = sum(leaf.nbytes for leaf in jax.tree.leaves((state, self.model, self.features)))
+            check_fits(self._compiled[count], batch, there)
+        else:
+            self._ready((self.copied(state), *self._indices(0, count), 0, *self._placed()))
+        trim_memory()
 
     def run_chunk(self, state: TrainState, first: int, count: int, steps: int) -> tuple[TrainState, dict[str, Array]]:
         """Take the steps first to first + count of `steps`; the state given is used up. Return the new one and the logs."""
-        arguments = self._arguments(state, first, count, steps)
+        arguments = state, *self._indices(first, count), steps, *self._placed()
         return self._ready(arguments)(*jax.tree.leaves(arguments))
 
     def measure(self, params: dict, done: int) -> dict[str, float]:
@@ -144,12 +159,15 @@ class PlacedScene:
     def refresh(self, params: dict, step: int) -> None:
         """Take the motions that are trained on from a step on, and what the network adds to them: see `Method.refresh`."""
         self._show(step // self._every)
+        told: dict[str, Array] = {}
         if self.assembly.network.refreshes:
             told = refreshed(self.assembly.network, params, self.model, self._motions)
             told = {name: _and_still(array, len(self._bare.start)) for name, array in told.items()}
-            model, features = self._everywhere
             self.features = replace(self.features, **told)
-            self._everywhere = model, replace(features, **self.copied(told))
+        if self._everywhere is not None:
+            self._everywhere = self._everywhere[0], replace(self._everywhere[1], **self.copied(told))
+        elif self._compiled:
+            self._placed()
         if step and self.assembly.scene.training.focus and self.model.terms.collision is not None:
             self._weight = self._contacts(params)
 
@@ -170,8 +188,8 @@ class PlacedScene:
         learned = learn_pose_stiffness(self.assembly, params, self._motions, steps, self.seed)
         if learned is self.assembly:
             return False
-        self.assembly, self.model = learned, replace(self.model, vibrations=learned.model.vibrations)
-        self._everywhere = self.copied(self.model), self._everywhere[1]
+        self.assembly = learned
+        self._change(replace(self.model, vibrations=learned.model.vibrations))
         self.refresh(params, done)
         return True
 
@@ -195,17 +213,21 @@ class PlacedScene:
             for upper in garment.uppers
         )
         surface = rebuild_lists(surface, list(zip(cloth, body, strict=True)))
-        self.model = replace(self.model, surface=surface, garment=replace(garment, uppers=uppers))
-        self._everywhere = self.copied(self.model), self._everywhere[1]
+        self._change(replace(self.model, surface=surface, garment=replace(garment, uppers=uppers)))
+
+    def _change(self, model: Model) -> None:
+        """Train with another model from here on."""
+        self.model = model
+        if self._everywhere is not None:
+            self._everywhere = self.copied(model), self._everywhere[1]
 
     def _show(self, number: int) -> None:
         """Place the motions of a share, or all of them where they are few, and recombined poses."""
-        training, spec, begun = required(self.assembly.training, "training"), self.assembly.scene.training, self._number >= 0
+        training, begun = required(self.assembly.training, "training"), self._number >= 0
         if number == self._number or (begun and training.shares is None and self._recombination is None):
             return
-        known, same = None, 0
-        if begun and training.shares is None and (bodies := self._everywhere[1].bodies) is not None:
-            known, same = self.local(bodies), len(self._motions.start)
+        if training.shares is None and self._everywhere is not None and (bodies := self._everywhere[1].bodies) is not None:
+            self._known = self.local(bodies), len(self._motions.start)
         self._everywhere = None  # before the next one takes as much memory
         self._number, self._pieces = number, training.shares.share(self.seed, number) if training.shares else []
         if training.shares is not None:
@@ -218,7 +240,14 @@ class PlacedScene:
             poses = recombined(self._recombination, POOL, [self.seed, 5, number])
             self._bare = _joined(self._motions, _standing(self.assembly.model, poses))
         self.features = self._bare
-        self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, spec.batch, known, same)))
+
+    def _placed(self) -> tuple[Model, MotionFeatures]:
+        """Return model and features, with bodies, on every device; the bodies are posed now if they were not."""
+        if self._everywhere is None:
+            known, self._known = self._known, (None, 0)
+            batch = self.assembly.scene.training.batch
+            self._everywhere = replicate(self.mesh, (self.model, with_bodies(self.model, self.features, batch, *known)))
+        return self._everywhere
 
     def _ends(self, first: int, count: int) -> np.ndarray:
         """Return the last frames of the windows of some steps, (count, batch)."""
@@ -234,11 +263,12 @@ class PlacedScene:
             ends = focused(ends, pool, np.ones(POOL), spec.recombined, seed, first, stream=6)
         return ends
 
-    def _arguments(self, state: TrainState, first: int, count: int, steps: int) -> tuple:
+    def _indices(self, first: int, count: int) -> tuple[Array, Array]:
+        """Return the windows of some steps and their partners, (count, batch) both, on the devices."""
         ends = self._ends(first, count)
         each = [np.random.default_rng([self.seed, 1, step]) for step in range(first, first + count)]
         pairs = np.stack([rng.permutation(ends.shape[1]) for rng in each]).astype(np.int32)
-        return (state, *shard_batch(self.mesh, (ends, pairs)), steps, *self._everywhere)
+        return shard_batch(self.mesh, (ends, pairs))
 
     def _ready(self, arguments: tuple) -> Compiled:
         """Return the program for a chunk's arguments, compiled once for every number of steps."""

@@ -105,7 +105,6 @@ def measure_costs(
         return work
 
     relisted = _seconds(compiled(lists))
-    placed.compile(state, CHUNK)
     placed.measure(state.params, CHUNK)
     step = _seconds(chunk)
     if step < SLOW:  # a first time takes a little more

@@ -138,9 +138,9 @@ def train_assembly(
     state = placed.initial_state(begun.params)
     placed.refresh(state.params, 0)
     steps, minutes = length
-    if facts is None:  # before anything is written: whether it fits into memory
-        placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or assembly.scene.training.steps))
-        facts = {"steps": 0, **begun.said}
+    # Before anything is written: whether it fits into memory.
+    placed.compile(state, CHUNK if minutes is not None else min(CHUNK, steps or assembly.scene.training.steps))
+    facts = {"steps": 0, **begun.said} if facts is None else facts
     with closing(_Output(placed, out, report, facts)) as output:
         if begun.params is not None and begun.facts is None:
             output.save(0, state)  # a run that is killed has these weights no more
@@ -327,8 +327,6 @@ class _Loop:
         due = self._settle is None and done in (whole_chunks(self._steps // 2), self._steps)
         if due and placed.learn_pose_stiffness(here.params, done, self._steps):
             self._output.keep(done, placed.assembly)
-        if self._timed is None:  # this chunk was compiled
-            trim_memory()
         energies = {k: float(v) for k, v in jax.tree.map(lambda a: a[-1], logs).items()}
         try:
             self._output.tell(self._entry(done, here, energies))

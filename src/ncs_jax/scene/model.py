@@ -187,15 +187,17 @@ def touched_body(
 def posed_bodies(model: Model, matrices: Float[Array, "frames joints 3 4"], lanes: int) -> Float[Array, "frames body 6"]:
     """Return positions in m and normals of the touchable body in many frames, `lanes` of them at a time."""
     frames = len(matrices)
-    at = np.minimum(np.arange(-(-frames // lanes) * lanes), frames - 1).reshape(-1, lanes)
+    lanes = min(lanes, frames)
+    firsts = np.minimum(np.arange(0, frames, lanes), frames - lanes)  # the last ones may be posed twice
 
-    def some(matrices):
-        matrices = jnp.moveaxis(matrices, 0, -1)
-        body = pose_body(model, matrices)
-        return jnp.concatenate([body, body_normals(model, body, matrices)], axis=1)
+    def some(bodies, first):
+        at = jnp.moveaxis(lax.dynamic_slice_in_dim(matrices, first, lanes), 0, -1)
+        body = pose_body(model, at)
+        posed = jnp.moveaxis(jnp.concatenate([body, body_normals(model, body, at)], axis=1), -1, 0)
+        return lax.dynamic_update_slice_in_dim(bodies, posed, first, 0), None  # in place: a second copy of all is large
 
-    blocks = lax.map(some, matrices[at])
-    return jnp.moveaxis(blocks, -1, 1).reshape(-1, *blocks.shape[1:3])[:frames]
+    body = jax.eval_shape(pose_body, model, matrices[0])
+    return lax.scan(some, jnp.zeros((frames, body.shape[0], 6), body.dtype), firsts)[0]
 
 
 @jax.jit

@@ -79,14 +79,17 @@ def free_memory() -> int | None:
     return min(known, default=None)
 
 
-def check_fits(program: Compiled, batch: int) -> None:
+def check_fits(program: Compiled, batch: int, there: int | None = None) -> None:
     """Check that a compiled training program of so many windows a step fits into memory.
 
+    there: bytes of its arguments that are in memory already; None: all of them are.
+
     Raises:
-        InputError: what it needs beside its arguments is more than is free.
+        InputError: what else it needs is more than is free.
     """
     size, free = program.memory_analysis(), free_memory()
     needed = 0 if size is None else size.temp_size_in_bytes + size.output_size_in_bytes - size.alias_size_in_bytes
+    needed += 0 if size is None or there is None else max(0, size.argument_size_in_bytes - there)
     if free is not None and needed > free:
         raise InputError(
             "training does not fit into memory", field="training.batch", value=batch,

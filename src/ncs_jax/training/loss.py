@@ -26,7 +26,7 @@ __all__ = ["gradients", "physics", "tangle", "with_bodies"]
 
 More = Callable[[Array], tuple[dict[str, Array], Array]]
 
-BODIES = 3 << 27  # bytes of posed bodies that are kept, at most
+BODIES = 1 << 29  # bytes of posed bodies that are kept, at most: about what compiling takes and gives back before them
 UNTANGLED = 16  # poses of a batch for each in which it is looked where the garment passes through itself
 
 

@@ -27,15 +27,14 @@ class Programs:
         self._threads = ThreadPoolExecutor(THREADS, "compile")
         self._begun: dict[tuple, Future[Compiled]] = {}
 
-    def begin(self, name: str, program: Callable, leaves: Sequence, structure: PyTreeDef, *, reused: bool = False) -> None:
-        """Begin to compile a program, known by a name, for arguments whose leaves are given, or no more than their shapes."""
-        self._future(name, program, leaves, structure, reused)
-
     def ready(self, name: str, program: Callable, *arguments, reused: bool = False) -> Compiled:
         """Return a program for arguments, compiled; it is begun now unless it was for others of their shapes and types."""
-        return self._future(name, program, *jax.tree.flatten(arguments), reused).result()
+        return self.begin(name, program, *jax.tree.flatten(arguments), reused=reused).result()
 
-    def _future(self, name: str, program: Callable, leaves: Sequence, structure: PyTreeDef, reused: bool) -> Future[Compiled]:
+    def begin(
+        self, name: str, program: Callable, leaves: Sequence, structure: PyTreeDef, *, reused: bool = False
+    ) -> Future[Compiled]:
+        """Begin to compile a program, known by a name, for arguments whose leaves are given, or no more than their shapes."""
         kind = name, structure, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         if kind not in self._begun:
             first = range(structure.children()[0].num_leaves) if reused else ()

@@ -14,7 +14,7 @@ from ncs_jax.energies.contact.halfway import Halfway, halfway_from
 from ncs_jax.energies.contact.points import ContactPoints, with_points
 from ncs_jax.geometry.mesh import corners, gathered, topology, vertex_rings
 from ncs_jax.geometry.numerics import normalize
-from ncs_jax.geometry.soa_vectors import cross, direction, minus, plus
+from ncs_jax.geometry.soa_vectors import cross, minus, plus
 
 __all__ = ["Surface", "compact_groups", "face_normals", "moving_normals", "rebuild_lists", "surface_from", "vertex_normals"]
 
@@ -161,16 +161,12 @@ def face_normals(body: Float[Array, "body 3"], faces: Int[Array, "faces 3"]) -> 
 
 def vertex_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
     """Return area-weighted unit normals of the body's vertices."""
-    return _unit(_areas(body, surface.faces, surface.rings))
+    return normalize(_areas(body, surface.faces, surface.rings), axis=1)
 
 
 def moving_normals(body: Float[Array, "body 3 *poses"], surface: Surface) -> Float[Array, "body 3 *poses"]:
     """Return the same of a body that is differentiated: backward alone, by sums over neighbours that scatter nothing."""
-    return _unit(_moving_areas(body, surface.faces, surface.rings))
-
-
-def _unit(total):
-    return jnp.stack(direction([total[:, i] for i in range(3)]), axis=1)
+    return normalize(_moving_areas(body, surface.faces, surface.rings), axis=1)
 
 
 def _areas(body, faces, rings):
