@@ -101,6 +101,13 @@ def test_what_is_validated_on_is_not_trained_on_and_no_motion_comes_twice(folder
     assert len(twice) == 2  # as written, by itself
 
 
+def test_a_list_in_a_list_is_refused(folder):
+    (folder / "inner.txt").write_text("ncs:walk\n")
+    (folder / "list.txt").write_text("ncs:dance\ninner.txt[3:]\n")
+    with pytest.raises(InputError, match=r"list\.txt: .*no other list \(found .inner\.txt\[3:\].\)"):
+        scene(folder, "list.txt")
+
+
 @pytest.mark.parametrize("name", ["empty", "motions/*.fbx", "list.txt"])
 def test_where_there_is_no_motion_the_name_is_refused(folder, name):
     (folder / "empty").mkdir()

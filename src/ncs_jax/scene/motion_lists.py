@@ -113,7 +113,10 @@ def _many(name: str, path: Callable[[str], Path]) -> tuple[list[str], Counter] |
         for line in _lines(there):
             inner = os.path.normpath(Path(file).parent / line) if not line.startswith("ncs:") else line
             inner += slices if slices and split_frames(line)[1] is None else ""
-            below = None if _is_list(split_frames(inner)[0]) else _many(inner, path)
+            if _is_list(split_frames(inner)[0]):
+                mend = f"write its motions into {there.name}, or name both in motion.files"
+                raise InputError("a motion, a folder or a pattern expected, no other list", file=there, value=line, mend=mend)
+            below = _many(inner, path)
             motions += [inner] if below is None else below[0]
             skipped += Counter() if below is None else below[1]
         return motions, skipped
