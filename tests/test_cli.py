@@ -1,5 +1,6 @@
 """The commands: what they print and write, and one line with exit code 2 for every broken input."""
 
+import gc
 import json
 import os
 import re
@@ -22,6 +23,7 @@ from rich.console import Console
 
 from ncs_jax import io
 from ncs_jax.cli import animate, check, main, preview
+from ncs_jax.cli.parser import _never_lost
 from ncs_jax.cli.progress import WorkProgress
 from ncs_jax.cli.train import _TrainingBar
 from ncs_jax.errors import InputError
@@ -499,7 +501,7 @@ def test_resume_drops_no_option(run_folder, tmp_path, capsys, monkeypatch):
     assert first.startswith(
         "ncs: warning: 0.001 minutes hold about 10 steps on this machine, up to step 20: too few to learn from"
     )
-    assert re.search("300 steps in all take about [0-9]+ minutes more$", first)
+    assert re.search("300 steps in all take about [0-9]+ minutes? more$", first)
     assert last.startswith("ncs: warning: only 20 steps were taken")
     assert last.endswith(f"ncs train --out {out} --resume --minutes M goes on")
     with pytest.raises(SystemExit):
@@ -531,9 +533,40 @@ def test_an_interrupted_training_keeps_its_last_steps(run_folder, tmp_path, caps
     assert "stopping after these steps" in said.out and signal.getsignal(signal.SIGINT) is handler
     assert said.err == f"ncs: interrupted; `ncs train --out '{out}' --resume` goes on from the last checkpoint\n"
     assert shown == [10, 20] and load_run(out).steps == 30
+    assert not load_run(out).trained.strain  # which is known at the end
     assert main(["train", "--out", str(out), "--resume", "--steps", "40"]) == 0
     said = capsys.readouterr().out
     assert "going on from step 30" in said and "step 40/40" in said
+    strain = load_run(out).trained.strain
+    del shown[1:]
+    assert strain > 0 and main(["train", "--out", str(out), "--resume", "--steps", "90"]) == 130  # it is not that of step 40
+    assert not load_run(out).trained.strain and load_run(out).known.strain > 0
+    step = load_run(out).steps
+    assert main(["train", "--out", str(out), "--resume", "--steps", str(step)]) == 0  # nothing is left but that
+    assert "nothing was trained" in capsys.readouterr().out and load_run(out).trained.strain > 0
+
+
+def test_ctrl_c_that_python_drops_comes_again(monkeypatch):
+    """JAX has the collector of garbage call it, and what is raised there is dropped."""
+    monkeypatch.setattr(sys, "unraisablehook", _never_lost(sys.unraisablehook))
+    pressed = []
+
+    def collected(phase, info):
+        if phase == "start" and not pressed:
+            pressed.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.callbacks.append(collected)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            gc.collect()
+            pressed.append("later")
+            time.sleep(10)
+    finally:
+        gc.callbacks.remove(collected)
+        signal.signal(signal.SIGINT, handler)
+    assert pressed == ["start", "later"]
 
 
 def test_a_run_is_drawn_again_the_picture_first(run_folder, tmp_path, capsys, monkeypatch):

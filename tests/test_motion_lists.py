@@ -12,7 +12,7 @@ import pytest
 from ncs_jax import io
 from ncs_jax.errors import InputError, InputWarning
 from ncs_jax.io.packaged import packaged
-from ncs_jax.prepare.motion_import import load_motions
+from ncs_jax.prepare.motion_import import load_motion, load_motions
 from ncs_jax.scene.spec import load_scene, scene_from
 
 FILES = ("A/s 1/jump_poses.npz", "A/s 1/walk_poses.npz", "B/Subject_2_F/run_stageii.npz", "dance.bvh", "own.npz")
@@ -112,8 +112,19 @@ def test_a_list_in_a_list_is_refused(folder):
 def test_where_there_is_no_motion_the_name_is_refused(folder, name):
     (folder / "empty").mkdir()
     (folder / "list.txt").write_text("# none\n")
-    with pytest.raises(InputError, match=r"motion\.validation: motions expected there"):
+    with pytest.raises(InputError, match=r"motion\.validation: motions expected there") as refused:
         scene(folder, validation=[name])
+    assert ("this list names none" in refused.value.mend) == (name == "list.txt")
+
+
+def test_a_motion_of_a_list_that_is_not_there_is_told_with_the_list(folder):
+    (folder / "list.txt").write_text(f"motions/{FILES[0]} [:2]\nmotions/nosuch.bvh\n")  # a space before the frames
+    given = scene(folder, "list.txt")
+    assert given.motion.files == (f"motions/{FILES[0]}[:2]", "motions/nosuch.bvh")
+    with pytest.raises(InputError, match=r"motion\.files: no such file.*nosuch\.bvh.*or what lists it: list\.txt"):
+        load_motion(given, "motions/nosuch.bvh", None)
+    with pytest.raises(InputError, match=r"list\.txt: one motion expected .*name one of the motions that it lists"):
+        load_motion(given, str(folder / "list.txt"), None)
 
 
 def test_all_broken_motions_are_told_at_once_or_skipped(folder):

@@ -112,9 +112,9 @@ def tell_risk(risk: Risk) -> None:
 
 
 def tell_beyond(found: Coverage | None) -> None:
-    """Print that a motion is beyond what a run was trained on, where it is."""
-    if found is not None and found.told:
-        tell("beyond", str(found))
+    """Print that a motion is beyond what a run was trained on, where it is, or that frames of it are."""
+    if found is not None and (found.told or found.outside.any()):
+        tell("beyond" if found.told else "coverage", str(found))
 
 
 def tell_skin(found: SkinShown, assembly: Assembly) -> None:

@@ -68,7 +68,7 @@ def evaluate(options) -> int:
     if scene is None:
         run = load_run(target)
         run.check_terms()
-        run = replace(run, trained=run.known())
+        run = replace(run, trained=run.known)
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
         if options.reference is not None and len(names) > 1:
             raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")

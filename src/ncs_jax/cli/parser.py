@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import contextlib
 import gc
 import os
 import shlex
 import sys
+import threading
 import warnings
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -50,6 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the simulator's matrices are small: two threads take 1.3 times as long
     if arguments is None:  # the process is ours: tracing makes many objects, and to look for cycles took a tenth of a start
         _keep_compiled_programs()
+        sys.unraisablehook = _never_lost(sys.unraisablehook)
         gc.freeze()
         gc.set_threshold(10_000, 20, 50)
     try:
@@ -66,13 +70,33 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         given = {name: shlex.quote(value) for name, value in vars(parsed).items() if isinstance(value, str)}
         goes_on = GOES_ON.get(parsed.run, "").format(**given)
-        if parsed.run in (train.train, train.demo) and not (Path(parsed.out) / "run.json").exists():
-            goes_on = " before the first step: the same command begins again"
+        if parsed.run in (train.train, train.demo):
+            if not (Path(parsed.out) / "run.json").exists():
+                goes_on = " before the first step: the same command begins again"
+            elif not any(Path(parsed.out).glob("checkpoints/[0-9]*")):
+                goes_on = goes_on.replace("goes on from the last checkpoint", "begins again: no checkpoint was due")
         print(f"ncs: interrupted{goes_on}", file=sys.stderr)
         code = 130
     if getattr(parsed, "hosts", None) is not None:
         train.leave(code)
     return code
+
+
+AGAIN = 0.1  # s
+
+
+def _never_lost(hook: Callable) -> Callable:
+    """Return a hook that has Ctrl-C come again where Python drops it, as in what JAX has its collector of garbage call."""
+
+    def dropped(what) -> None:
+        if issubclass(what.exc_type, KeyboardInterrupt):
+            later = threading.Timer(AGAIN, _thread.interrupt_main)
+            later.daemon = True
+            later.start()
+        else:
+            hook(what)
+
+    return dropped
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

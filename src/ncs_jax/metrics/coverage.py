@@ -7,7 +7,7 @@ Motions strain it unequally: a frame near a trained one is compared with that on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from ncs_jax.scene.features import MotionFeatures
 from ncs_jax.scene.model import Model
 
-__all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "spread_frames", "trained_motion", "with_strain"]
+__all__ = ["FAR", "Coverage", "TrainedMotion", "coverage", "fault_of", "trained_motion", "with_strain"]
 
 FAR = 0.2  # distance of a pose from the nearest trained one at which the energy is a tenth above what adapting reaches
 FAST = 2.0  # times the largest trained rate, and twice as much of the accelerations, are the limit
@@ -26,6 +26,7 @@ TOLD = 0.1  # of the energy, above which a motion is told to be beyond
 CARRIED = 0.005  # of the garment, that a joint and those below it carry at least, if it counts
 KEPT = 1024  # poses of a joint, at most
 STRAINS = 320  # frames of which the strain is kept, at most
+MEAN = 256  # frames that the mean strain is of
 CLOSE = 0.03  # distance within which every trained pose of a joint has a kept one, if there are no more than `KEPT`
 SEEN = 8192  # frames that are looked at, at most
 STILL = 0.1, 0.5  # 1/s, m/s^2: least limits of rates and accelerations
@@ -56,6 +57,10 @@ class TrainedMotion:
     frames: Float[np.ndarray, "strains joints 9"] = field(default_factory=lambda: np.zeros((0, 0, 9)))
     frame_strain: Float[np.ndarray, "strains"] = field(default_factory=lambda: np.zeros(0))
     frame_radius: float = 0.0
+
+    def without_strain(self) -> TrainedMotion:
+        """Return it as it is until the strain is known."""
+        return TrainedMotion(self.poses, self.joint, self.radius, self.rates, self.accelerations)
 
 
 @dataclass(frozen=True)
@@ -122,13 +127,16 @@ class Coverage:
     def __str__(self) -> str:
         """Return the share of frames, the worst of them, the strain, and what helps, in a sentence."""
         text = "every frame is near the poses and speeds that the run was trained on"
+        if self.told:
+            text = "its poses and speeds are near those that the run was trained on"
         if self.outside.any():
             frame, joint, what = self.worst
             text = f"{self.share:.0%} of the frames are beyond the poses and speeds that the run was trained on"
             text += f", frame {frame} most, by the {what} of {joint}"
         if not self.told:
             return text
-        strain = f"; cloth is strained {self.strain:.1f} times as much as on these" if self.strain else ""
+        joined = " and" if self.outside.any() else ", but"
+        strain = f"{joined} the cloth is strained {self.strain:.1f} times as much as there" if self.strain else ""
         return f"{text}{strain}; adapt it with --adapt 20 (in Python ncs_jax.adapt), or train on such motion"
 
 
@@ -144,21 +152,42 @@ def trained_motion(model: Model, track: MotionFeatures) -> TrainedMotion:
     return TrainedMotion(kept.astype(np.float16), joint, radius, rates.max(axis=0), accelerations.max(axis=0))
 
 
-def spread_frames(model: Model, track: MotionFeatures, among: np.ndarray) -> np.ndarray:
-    """Return the numbers of frames of a track that are far from each other, `STRAINS` at most `among` those given."""
+def with_strain(
+    trained: TrainedMotion, model: Model, track: MotionFeatures, among: np.ndarray, strain: Callable[[np.ndarray], np.ndarray]
+) -> TrainedMotion:
+    """Return it with the strain of the trained garment: its mean, and that in frames of a track that are far from each other.
+
+    among: the frames that were trained on. strain: gives that in the frames of some numbers, %.
+    """
     poses = _described(model, track)[0]
     some = among[np.unique(np.linspace(0, len(among) - 1, min(len(among), SEEN)).astype(int))]
-    return some[_spread(poses[some].reshape(len(some), -1), STRAINS)[0]]
+    chosen = some[_spread(poses[some].reshape(len(some), -1), STRAINS)[0]]
+    kept, mean = poses[chosen].astype(np.float16), strain(among[np.linspace(0, len(among) - 1, MEAN).astype(int)]).mean()
+    radius = float(np.percentile(_nearest(poses, kept)[0], 95))
+    return replace(
+        trained, strain=float(mean), frames=kept, frame_strain=strain(chosen).astype(np.float32), frame_radius=radius
+    )
 
 
-def with_strain(
-    trained: TrainedMotion, model: Model, track: MotionFeatures, frames: np.ndarray, strain: np.ndarray, mean: float
-) -> TrainedMotion:
-    """Return it with the strain, %, that the trained garment has in some frames of a track, and its mean over all of them."""
-    poses = _described(model, track)[0]
-    kept = poses[frames].astype(np.float16)
-    radius = float(np.percentile(_nearest_frame(poses, kept)[0], 95))
-    return replace(trained, strain=mean, frames=kept, frame_strain=strain.astype(np.float32), frame_radius=radius)
+def fault_of(trained: TrainedMotion, model: Model) -> tuple[str, str, str] | None:
+    """Return which field is none that a run of this model keeps, what is expected there, and what it is; None if all are."""
+    joints, kept, strains = len(_carrying(model)), np.shape(trained.poses)[:1], np.shape(trained.frame_strain)[:1]
+    shapes = {
+        "poses": (*kept, 9), "joint": kept, **dict.fromkeys(("radius", "rates", "accelerations"), (joints,)),
+        "strain": (), "frames": (*strains, joints if any(strains) else 0, 9), "frame_strain": strains, "frame_radius": (),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        array = np.asarray(getattr(trained, name))
+        if array.shape != shape:
+            return name, f"shape {shape}", f"{array.shape}"
+        if array.dtype.kind not in "iuf":
+            return name, "numbers", f"{array.dtype}"
+        least = -np.inf if name in ("poses", "frames") else 0
+        if (wrong := ~(np.isfinite(array) & (array >= least))).any():
+            return name, "finite numbers" if least else "finite numbers, none below 0,", f"{array[wrong].flat[0]}"
+    if set(trained.joint.tolist()) != set(range(joints)):
+        return "joint", f"poses of each of {joints} joints", f"those of {len(set(trained.joint.tolist()))}"
+    return None
 
 
 def coverage(
@@ -186,7 +215,8 @@ def coverage(
         strain: (frames / every,) that of the garment in every so many frames, %, as the network has it; None: nobody knows.
     """
     poses, rates, accelerations = _described(model, track)
-    far = np.stack([_nearest(poses[:, j], trained.poses[trained.joint == j]) for j in range(poses.shape[1])], axis=1)
+    kept = [trained.poses[trained.joint == j, None] for j in range(poses.shape[1])]
+    far = np.stack([_nearest(poses[:, j : j + 1], kept[j])[0] for j in range(poses.shape[1])], axis=1)
     far = np.maximum(far - trained.radius, 0) / FAR
     fast = rates / np.maximum(FAST * trained.rates, STILL[0])
     fast = np.maximum(fast, accelerations / np.maximum(2 * FAST * trained.accelerations, STILL[1]))
@@ -198,9 +228,9 @@ def coverage(
 
 def _expected(trained: TrainedMotion, poses: np.ndarray) -> np.ndarray:
     """Return the strain e_t of `coverage` in poses (frames, joints, 9), %."""
-    if not len(trained.frames):  # a run of an earlier version
+    if not len(trained.frames):  # a run of an earlier version whose motions are gone
         return np.full(len(poses), trained.strain)
-    far, nearest = _nearest_frame(poses, trained.frames)
+    far, nearest = _nearest(poses, trained.frames)
     near = np.maximum(1 - np.maximum(far - trained.frame_radius, 0) / FAR, 0)
     return trained.strain + near * np.maximum(trained.frame_strain[nearest] - trained.strain, 0)
 
@@ -255,18 +285,11 @@ def _spread(poses: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         chosen.append(int(far.argmax()))
 
 
-def _nearest(poses: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return the distance of each pose (frames, 9) to the nearest kept one."""
-    kept = kept.astype(np.float64)
-    parts = np.split(poses, range(BLOCK, len(poses), BLOCK))
-    return np.concatenate([np.linalg.norm(part[:, None] - kept, axis=-1).min(axis=1) for part in parts])
-
-
-def _nearest_frame(poses: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(poses: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how far the farthest joint of each pose (frames, joints, 9) is from the nearest kept pose, and which that is."""
-    kept, far, which = kept.astype(np.float32), [], []
-    for part in np.split(poses.astype(np.float32), range(BLOCK, len(poses), BLOCK)):
-        away = np.zeros((len(part), len(kept)), np.float32)
+    kept, far, which = kept.astype(np.float64), [], []
+    for part in np.split(poses, range(BLOCK, len(poses), BLOCK)):
+        away = np.zeros((len(part), len(kept)))
         for joint in range(poses.shape[1]):
             a, b = part[:, joint], kept[:, joint]
             square = (a * a).sum(1)[:, None] - 2 * a @ b.T + (b * b).sum(1)

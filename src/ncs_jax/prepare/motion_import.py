@@ -313,6 +313,9 @@ def load_motion(scene: Scene, name: str, body: io.BodyRecord | None) -> io.Motio
     gravity = np.array(scene.physics.gravity)
     if path.suffix.lower() in ("", *LISTING) and not path.exists():  # else its suffix would be at fault
         raise InputError("no such file or folder", file=path, mend="check the path")
+    if path.suffix.lower() in LISTING:
+        mend = "name one of the motions that it lists; the lists of a scene, motion.files and validation, take all of them"
+        raise InputError("one motion expected", file=path, value="a list", mend=mend)
     try:
         record = io.read_motion(path, frame_range=chosen)
         read = (

@@ -123,7 +123,6 @@ def adapt(
     now, spent = _standing(out, facts, begins)
     told = {} if facts is None else facts["adapted"]
     if spent >= seconds and "after" in told:
-        now = replace(now, trained=read_trained(out) if out is not None else None)
         return Adapted(now, told["before"], told["after"], told["seconds"], told["kept"], out)
     programs = Programs()
     begin_programs(programs, begins.assembly, CHUNK)  # while it is measured
@@ -133,7 +132,7 @@ def adapt(
         best(now.params)
     told = {**about, "seconds": seconds, "before": best.before}
     said = {"start": str(Path(run.assembly.scene.source).parent), **_own_facts(run, out), "adapted": told}
-    begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since)
+    begun = Begun(None if facts is None else facts | said, said, run.params, scene.training.seed, since, now.trained)
     left = None, (seconds - spent) / 60
     say("compiling what trains it")
     adapted = train_assembly(begins.assembly, out, begun, left, programs=programs, report=report, settle=best)
@@ -168,7 +167,8 @@ def _standing(out: Path | None, facts: dict | None, begins: Run) -> tuple[Run, f
     if steps is None:
         raise InputError("no checkpoint there yet", file=out, mend="delete this folder")
     state = checkpoints.restore(jax.eval_shape(lambda: initial_state(a.model, a.network, 0)))
-    return replace(begins, params=state.params, steps=steps), facts["adapted"]["seconds"] * (steps / max(facts["steps"], 1))
+    now = replace(begins, params=state.params, steps=steps, trained=read_trained(out, a.model))
+    return now, facts["adapted"]["seconds"] * (steps / max(facts["steps"], 1))
 
 
 def _facts_of(out: Path | None, about: dict) -> dict | None:

@@ -3,7 +3,7 @@
     RUN/run.json                the scene, the steps planned, the seed, the versions
     RUN/prepared.npz            what was computed from the scene's files: skinning weights, touchable part, modes
     RUN/prepared-STEP.npz       the same with what training found of the garment at a step: its stiffness by pose
-    RUN/trained.npz             what poses and speeds it was trained on
+    RUN/trained.npz             what poses and speeds it was trained on, and how much the cloth is strained there
     RUN/checkpoints/STEP/       Orbax: parameters, optimiser, counters; the last two are kept
     RUN/log.csv                 one row a report
 
@@ -30,8 +30,9 @@ import numpy as np
 
 from ncs_jax.errors import InputError
 from ncs_jax.io.tables.npz import read_npz, write_npz
-from ncs_jax.metrics.coverage import TrainedMotion
+from ncs_jax.metrics.coverage import TrainedMotion, fault_of
 from ncs_jax.prepare.prepared import Prepared
+from ncs_jax.scene.model import Model
 
 __all__ = [
     "Checkpoints",
@@ -136,19 +137,27 @@ def write_trained(run: Path, trained: TrainedMotion) -> None:
     write_npz(run / "trained.npz", **vars(trained))
 
 
-def read_trained(run: Path) -> TrainedMotion | None:
-    """Read RUN/trained.npz; None in a run of an earlier version, which has none.
+def read_trained(run: Path, model: Model) -> TrainedMotion | None:
+    """Read RUN/trained.npz; None in a run that has none, as one of an earlier version.
 
     Raises:
-        InputError: it is damaged.
+        InputError: it is damaged, or of another garment or body than the run's model.
     """
-    path, fields = Path(run) / "trained.npz", dataclasses.fields(TrainedMotion)
+    path, names = Path(run) / "trained.npz", [f.name for f in dataclasses.fields(TrainedMotion)]
+    mend = "delete this file: what it keeps is found again from the motions of the scene"
     if not path.exists():
         return None
-    table = read_npz(path, {f.name for f in fields}.__contains__)
-    later = {"strain", "frames", "frame_strain", "frame_radius"}  # than the first version
-    known: dict[str, Any] = {f.name: table.array(f.name)[()] for f in fields if f.name in table or f.name not in later}
-    return TrainedMotion(**known)
+    try:
+        table = read_npz(path, names.__contains__)
+        frames = [name for name in names if name.startswith("frame")]
+        later = () if any(name in table for name in frames) else ("strain", *frames)  # than the first versions
+        known: dict[str, Any] = {name: table.array(name)[()] for name in names if name in table or name not in later}
+    except InputError as error:
+        raise InputError(error.expected, file=path, field=error.field, value=error.value, mend=mend) from None
+    if fault := fault_of(trained := TrainedMotion(**known), model):
+        field, expected, value = fault
+        raise InputError(f"{expected} expected", file=path, field=field, value=value, mend=mend)
+    return trained
 
 
 class Checkpoints:

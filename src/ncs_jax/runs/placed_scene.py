@@ -18,7 +18,7 @@ from jaxtyping import Array
 from ncs_jax.energies.contact.surface import rebuild_lists
 from ncs_jax.errors import required
 from ncs_jax.io.records import MotionRecord
-from ncs_jax.metrics.coverage import TrainedMotion, spread_frames, with_strain
+from ncs_jax.metrics.coverage import TrainedMotion, with_strain
 from ncs_jax.network.methods.method import Method
 from ncs_jax.network.methods.swing import Swing
 from ncs_jax.network.rollout import animate
@@ -39,7 +39,6 @@ __all__ = ["PlacedScene", "begin_programs"]
 
 SAMPLED = 64  # poses that the search for contacts is prepared for
 SEEN = 4  # frames that are measured between chunks
-MEAN = 160  # frames, of which the mean strain is taken at the end
 POOL = 512  # poses put together of the motions' limbs, others after every checkpoint, where a scene trains on any
 FOCUSED = 256  # frames, at most, whose contact is looked at for `training.focus`; those between are like them
 
@@ -123,10 +122,7 @@ class PlacedScene:
 
     def with_strain(self, trained: TrainedMotion, params: dict) -> TrainedMotion:
         """Return what is known of the motions that are trained on, with how much they strain the garment."""
-        even = self._last[np.linspace(0, len(self._last) - 1, MEAN).astype(int)]
-        frames = spread_frames(self.model, self._motions, self._last)
-        mean = float(self._strain(params, even).mean())
-        return with_strain(trained, self.model, self._motions, frames, self._strain(params, frames), mean)
+        return with_strain(trained, self.model, self._motions, self._last, functools.partial(self._strain, params))
 
     def _strain(self, params: dict, frames: np.ndarray) -> np.ndarray:
         """Return the garment's mean strain in each of these frames, %."""

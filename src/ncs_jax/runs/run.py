@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from ncs_jax.energies.terms import OwnTerm
 from ncs_jax.errors import InputError, check_alpha
 from ncs_jax.export.facts import FileFormat
 from ncs_jax.export.write import Exported, export
-from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion
+from ncs_jax.metrics.coverage import Coverage, TrainedMotion, coverage, trained_motion, with_strain
 from ncs_jax.metrics.quality import measure, measure_on_host
 from ncs_jax.metrics.seen import EVERY, measure_seen
 from ncs_jax.network.compression import compress
@@ -190,7 +191,7 @@ class Run:
         vertices: what `animate` gives for this motion, where that is there already. None is returned where nobody knows: of a
         run of an earlier version whose motions cannot be read any more.
         """
-        a, trained = self.assembly, self.known()
+        a, trained = self.assembly, self.known
         if trained is None:
             return None
         names, track, strain, every = a.body.joint_names if a.body is not None else (), self.track(motion), None, 1
@@ -200,16 +201,24 @@ class Run:
             strain = measure_on_host(a.model, x[::every])["strain_mean"]
         return coverage(trained, a.model, track, names=names, moving=a.network.state > 0, strain=strain, every=every)
 
+    @functools.cached_property
     def known(self) -> TrainedMotion | None:
-        """Return what the run was trained on, found again from the motions of its scene where it was not kept."""
-        a = self.assembly
-        if self.trained is not None or not a.scene.motion.files:
-            return self.trained
+        """Return what the run was trained on, found again from the motions of its scene where it was not kept as a whole.
+
+        Its strain is kept at the end of a training: one that was interrupted has none, nor has a run of an earlier version.
+        """
+        a, trained = self.assembly, self.trained
+        if not a.scene.motion.files or (trained is not None and len(trained.frames)):
+            return trained
         try:
             motions = {name: self.motion(name) for name in a.scene.motion.files}
         except InputError:
-            return None
-        return trained_motion(a.model, training_features(training_motions(replace(a, motions=motions)), a.model))
+            return trained
+        track = training_features(training_motions(replace(a, motions=motions)), a.model)
+        trained = trained_motion(a.model, track) if trained is None else trained
+        x = self.animate(track)
+        frames = np.arange(len(x))
+        return with_strain(trained, a.model, track, frames, lambda some: measure_on_host(a.model, x[some])["strain_mean"])
 
 
 def load_run(folder: str | Path, *, terms: Sequence[OwnTerm] = (), network: NetworkMaker | None = None) -> Run:
@@ -235,7 +244,7 @@ def load_run(folder: str | Path, *, terms: Sequence[OwnTerm] = (), network: Netw
         raise InputError("no checkpoint there yet", file=folder, mend="train it with ncs train --resume")
     like = jax.eval_shape(lambda: initial_state(assembly.model, assembly.network, 0))
     lacking = () if terms else tuple(facts.get("terms", ()))
-    return Run(assembly, checkpoints.restore(like).params, step, lacking, read_trained(folder))
+    return Run(assembly, checkpoints.restore(like).params, step, lacking, read_trained(folder, assembly.model))
 
 
 def own_names(terms: Sequence[OwnTerm], network: NetworkMaker | None) -> dict:

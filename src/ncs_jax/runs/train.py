@@ -85,7 +85,7 @@ def train(
         scene, seed = resumed_scene(facts, out, scene, seed, steps), facts["seed"]
         done = Checkpoints(out).latest()
         if minutes is None and done == (steps or facts["steps"]):  # nothing is left to train
-            return load_run(out, terms=terms, network=network)
+            return _finished(load_run(out, terms=terms, network=network), out)
         if say is not None:
             say(f"going on from step {done or 0}")
     if scene is None:
@@ -94,20 +94,22 @@ def train(
     begin = functools.partial(begin_programs, programs, count=first)  # while the rest is found out
     make_ready = functools.partial(assemble, terms=terms, network=network, report=say, ahead=begin)
     assembly, params = assemble_run(scene, facts, out, start, network, make_ready)
+    trained = read_trained(out, assembly.model) if out is not None and facts is not None else None
     trim_memory()
     if say is not None:
         say("compiling")
     begin(assembly)
     seed = assembly.scene.training.seed if seed is None else seed
     said = own_names(terms, network) | ({"start": str(start)} if start else {})
-    begun = Begun(facts, said, params, seed, began)
+    begun = Begun(facts, said, params, seed, began, trained)
     return train_assembly(assembly, out, begun, (steps, minutes), report=report, programs=programs)
 
 
 class Begun(NamedTuple):
     """Where a training begins: what run.json says of the run that is resumed, None of a new one; what else it is to say.
 
-    `params`: weights of another run, if it begins with some. `since`: when it was called for, s.
+    `params`: weights of another run, if it begins with some. `since`: when it was called for, s. `trained`: what was kept of
+    its motions, if it is resumed.
     """
 
     facts: dict | None
@@ -115,6 +117,15 @@ class Begun(NamedTuple):
     params: dict | None
     seed: int
     since: float
+    trained: TrainedMotion | None = None
+
+
+def _finished(run: Run, out: Path) -> Run:
+    """Return a run that has all its steps, in a folder, which keeps what a training that was interrupted did not."""
+    known = run.known
+    if known is not None and known is not run.trained:
+        write_trained(out, known)
+    return replace(run, trained=known)
 
 
 def train_assembly(
@@ -146,7 +157,7 @@ def train_assembly(
             output.save(0, state)  # a run that is killed has these weights no more
         state = output.restore(state)
         last, timed = _planned(placed, output, state, length, stiffness=settle is None)
-        trained = output.keep_motion()
+        trained = output.keep_motion(begun.trained)
         return _Loop(placed, output, placed.copied(state), last, begun.since, settle).run(trained, timed)
 
 
@@ -182,7 +193,11 @@ def _planned(
             upto = f", up to step {last}" if state.step else ""
             what = f"{minutes:g} minutes hold about {last - int(state.step)} steps on this machine{upto}: too few to learn from"
             more = " more" if state.step else ""
-            warnings.warn(f"{what}; {ENOUGH} steps in all take about {needed} minutes{more}", InputWarning, stacklevel=4)
+            warnings.warn(
+                f"{what}; {ENOUGH} steps in all take about {needed} minute{'s' * (needed > 1)}{more}",
+                InputWarning,
+                stacklevel=4,
+            )
     if last != output.planned:
         output.plan(last)
     return last, timed
@@ -209,11 +224,10 @@ class _Output:
             facts = self._facts | {"steps": steps, "seed": self._placed.seed, "scene": scene, "versions": _versions()}
             write_run(self._out, facts)
 
-    def keep_motion(self) -> TrainedMotion:
-        """Return what the run is trained on, and write it down if that was not done."""
-        if self._out is not None and (there := read_trained(self._out)) is not None:
-            return there
-        trained = trained_motion(self._placed.assembly.model, self._placed.assembly.track)
+    def keep_motion(self, there: TrainedMotion | None) -> TrainedMotion:
+        """Write down what the run is trained on, which may have been done, and return it; its strain is that of the end."""
+        a = self._placed.assembly
+        trained = trained_motion(a.model, a.track) if there is None else there.without_strain()
         self.write_motion(trained)
         return trained
 

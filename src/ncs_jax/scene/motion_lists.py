@@ -67,7 +67,7 @@ def each_motion(
         for name in given[key]:
             found, skipped = many.get(name, ([name], Counter()))
             if not found:
-                raise _nothing(name, skipped, f"motion.{key}", source)
+                raise _nothing(name, path(split_frames(name)[0]), skipped, f"motion.{key}", source)
             kept = found if name in alone else [m for m in dict.fromkeys(found) if m not in alone and m not in names]
             if name not in alone:
                 kept = [m for m in kept if real(m) not in validated] if validated else kept
@@ -83,9 +83,10 @@ def each_motion(
     return Found(lists["files"], lists["validation"], own, tuple(reversed(notes)))
 
 
-def _nothing(name: str, skipped: Counter, field: str, source: str) -> InputError:
+def _nothing(name: str, place: Path, skipped: Counter, field: str, source: str) -> InputError:
     kinds = ", ".join(f"{count} {kind}" for kind, count in skipped.most_common(SHOWN))
     mend = f"none of these is one: {kinds}" if kinds else "check the name, which is seen from the scene file"
+    mend = "this list names none: write a motion into each line" if place.is_file() and not kinds else mend
     return InputError("motions expected there", file=source, field=field, value=name, mend=mend)
 
 
@@ -193,7 +194,7 @@ def _lines(file: Path) -> Iterator[str]:
     from ncs_jax.io.tables.files import text_of
 
     rows = [re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip() for line in text_of(file)[1].split("\n")]
-    rows = [row for row in rows if row]
+    rows = [re.sub(r"\s+(\[[^\[\]]*\])$", r"\1", row) for row in rows if row]  # WALK.bvh [10:300]
     if file.suffix.lower() not in (".csv", ".tsv"):
         yield from rows
         return

@@ -267,6 +267,8 @@ class Scene:
         if name.startswith("ncs:") or path.exists() or ("#" in path.name and Path(str(path).rpartition("#")[0]).exists()):
             return path  # the file, or an animation or a mesh in it
         seen = "" if Path(name).is_absolute() else f"; it is seen from {Path(self.source).parent.absolute()}"
+        if field.startswith("motion.") and self.motion.found:  # "FILE: 3 motions"
+            seen += f", or what lists it: {', '.join(note.rpartition(': ')[0] for note in self.motion.found)}"
         raise InputError("no such file or folder", file=self.source, field=field, value=name, mend=f"check the path{seen}")
 
     def motion_file(self, name: str) -> tuple[Path, MotionSpec]:
