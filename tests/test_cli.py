@@ -809,6 +809,17 @@ def test_evaluate_a_run_and_the_animation_it_wrote(run_folder, tmp_path, capsys)
     one_line(capsys, ["--scene"])
 
 
+def test_a_run_without_motions_asks_for_one(run_folder, tmp_path, capsys):
+    _, folder = run_folder
+    run = shutil.copytree(folder, tmp_path / "run")
+    facts = json.loads((run / "run.json").read_text())
+    facts["scene"]["motion"] |= {"files": [], "validation": []}
+    (run / "run.json").write_text(json.dumps(facts))
+    for command in (["evaluate", str(run)], ["animate", str(run), "--out", str(tmp_path / "x.npz")]):
+        assert main(command) == 2
+        assert capsys.readouterr().err == "ncs: --motion: a motion is needed; give one: the scene has none\n"
+
+
 def test_evaluate_of_all_motions_tells_the_deepest_of_them(run_folder, tmp_path, monkeypatch, capsys):
     _, folder = run_folder
     np.savez(tmp_path / "nods.npz", **swing(size=3.0))

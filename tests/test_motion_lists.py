@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -114,13 +115,16 @@ def test_where_there_is_no_motion_the_name_is_refused(folder, name):
     (folder / "list.txt").write_text("# none\n")
     with pytest.raises(InputError, match=r"motion\.validation: motions expected there") as refused:
         scene(folder, validation=[name])
-    assert ("this list names none" in refused.value.mend) == (name == "list.txt")
+    assert ("none of its lines leads to one" in refused.value.mend) == (name == "list.txt")
 
 
 def test_a_motion_of_a_list_that_is_not_there_is_told_with_the_list(folder):
     (folder / "list.txt").write_text(f"motions/{FILES[0]} [:2]\nmotions/nosuch.bvh\n")  # a space before the frames
     given = scene(folder, "list.txt")
     assert given.motion.files == (f"motions/{FILES[0]}[:2]", "motions/nosuch.bvh")
+    shutil.copytree(folder / "motions" / "A", folder / "walks [old]")
+    (folder / "old.txt").write_text("walks [old]\n")
+    assert scene(folder, "old.txt").motion.files == scene(folder, "walks [old]").motion.files
     with pytest.raises(InputError, match=r"motion\.files: no such file.*nosuch\.bvh.*or what lists it: list\.txt"):
         load_motion(given, "motions/nosuch.bvh", None)
     with pytest.raises(InputError, match=r"list\.txt: one motion expected .*name one of the motions that it lists"):

@@ -70,6 +70,8 @@ def evaluate(options) -> int:
         run.check_terms()
         run = replace(run, trained=run.known)
         names = (options.motion,) if options.motion else tuple(dict.fromkeys(run.assembly.scene.motions))
+        if not names:
+            raise InputError("a motion is needed", field="--motion", mend="give one: the scene has none")
         if options.reference is not None and len(names) > 1:
             raise InputError("one motion is needed beside --reference", field="--motion", mend="give the one it was made from")
         for name in names:

@@ -186,7 +186,7 @@ def fault_of(trained: TrainedMotion, model: Model) -> tuple[str, str, str] | Non
         if (wrong := ~(np.isfinite(array) & (array >= least))).any():
             return name, "finite numbers" if least else "finite numbers, none below 0,", f"{array[wrong].flat[0]}"
     if set(trained.joint.tolist()) != set(range(joints)):
-        return "joint", f"poses of each of {joints} joints", f"those of {len(set(trained.joint.tolist()))}"
+        return "joint", f"every number from 0 to {joints - 1}", f"{sorted(set(trained.joint.tolist()))}"
     return None
 
 

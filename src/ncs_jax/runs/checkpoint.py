@@ -293,7 +293,8 @@ QUIET = ("asyncio", "absl")
 @contextlib.contextmanager
 def _quiet():
     """Say nothing of errors that nobody waits for: where one array is damaged, the others, still being read, have some each."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda what: hook(what) if issubclass(what.exc_type, KeyboardInterrupt) else None
     logs = {log: log.level for log in map(logging.getLogger, QUIET)}
     for log in logs:
         log.setLevel(logging.CRITICAL + 1)

@@ -212,11 +212,11 @@ class Run:
             return trained
         try:
             motions = {name: self.motion(name) for name in a.scene.motion.files}
-        except InputError:
+            track = training_features(training_motions(replace(a, motions=motions)), a.model)
+            x = self.animate(track)
+        except InputError:  # a file is gone, or what was learned is not finite there
             return trained
-        track = training_features(training_motions(replace(a, motions=motions)), a.model)
         trained = trained_motion(a.model, track) if trained is None else trained
-        x = self.animate(track)
         frames = np.arange(len(x))
         return with_strain(trained, a.model, track, frames, lambda some: measure_on_host(a.model, x[some])["strain_mean"])
 

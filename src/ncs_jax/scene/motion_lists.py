@@ -86,7 +86,11 @@ def each_motion(
 def _nothing(name: str, place: Path, skipped: Counter, field: str, source: str) -> InputError:
     kinds = ", ".join(f"{count} {kind}" for kind, count in skipped.most_common(SHOWN))
     mend = f"none of these is one: {kinds}" if kinds else "check the name, which is seen from the scene file"
-    mend = "this list names none: write a motion into each line" if place.is_file() and not kinds else mend
+    mend = (
+        "none of its lines leads to one: write a motion, a folder or a pattern into each"
+        if place.is_file() and not kinds
+        else mend
+    )
     return InputError("motions expected there", file=source, field=field, value=name, mend=mend)
 
 
@@ -194,7 +198,7 @@ def _lines(file: Path) -> Iterator[str]:
     from ncs_jax.io.tables.files import text_of
 
     rows = [re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip() for line in text_of(file)[1].split("\n")]
-    rows = [re.sub(r"\s+(\[[^\[\]]*\])$", r"\1", row) for row in rows if row]  # WALK.bvh [10:300]
+    rows = [re.sub(r"\s+(\[[-\d\s]*:[-\d\s]*\])$", r"\1", row) for row in rows if row]  # WALK.bvh [10:300]
     if file.suffix.lower() not in (".csv", ".tsv"):
         yield from rows
         return
