@@ -91,12 +91,13 @@ def test_what_the_plane_of_the_nearest_vertex_calls_inside_stays_where_it_is_out
 
 
 @pytest.mark.parametrize("poses", [1, 3])
-def test_few_points_find_their_triangle(rng, poses):
-    """Near the skin, as a search of all of them does."""
+@pytest.mark.parametrize("torn", [False, True])
+def test_few_points_find_their_triangle(rng, poses, torn):
+    """As a search of all of them does, also where groups are torn apart by a pose, so that every point is in many boxes."""
     body = np.stack([BALL * rng.uniform(0.8, 1.2, 3) for _ in range(poses)], axis=2)
     pose = np.arange(200) % poses
-    x = body[rng.integers(len(BALL), size=200), :, pose] + rng.normal(size=(200, 3)) * 0.01
-    surface = surface_from(BALL[:10], BALL, TRIANGLES)
+    x = body[rng.integers(len(BALL), size=200), :, pose] + rng.normal(size=(200, 3)) * rng.choice([0.01, 0.1], (200, 1))
+    surface = surface_from(BALL[:10], rng.permutation(BALL) if torn else BALL, TRIANGLES)
     every, at = jnp.asarray(body), jnp.asarray(pose, jnp.int32)
     found = nearest_of_few(list(jnp.asarray(x.T)), at, every, surface, boxes_around(every, surface))
     corners = jnp.transpose(every[TRIANGLES][..., at], (1, 2, 0, 3))  # (3 corners, 3, triangles, points)

@@ -28,7 +28,7 @@ __all__ = [
 
 
 NEAR = 32  # groups of the body's triangles that a group of cloth looks at in a pose of its own
-WIDE, BOXES = 4, 4  # groups that are one box for a point by itself, and how many of these it looks in
+WIDE = 4  # groups that are one box for a point by itself
 
 
 def _squared_to_points(x, points):
@@ -96,6 +96,11 @@ def smallest(values, count):
 
     By `count` passes over the table, which on a CPU is ten times faster than sorting it.
     """
+    return _take_smallest(values, count)[1]
+
+
+def _take_smallest(values, count):
+    """Return the table with infinity in the place of the smallest entries of every column, and their rows (count, columns)."""
     rows = jnp.arange(len(values), dtype=jnp.int32)[:, None]
 
     def take(left, _):
@@ -103,7 +108,7 @@ def smallest(values, count):
         row = jnp.where(left == least, rows, len(values) - 1).min(axis=0, keepdims=True)
         return jnp.where(rows == row, jnp.inf, left), row[0]
 
-    return lax.scan(take, values, None, length=count)[1]
+    return lax.scan(take, values, None, length=count)
 
 
 def nearest_groups(cloth, grouped, count):
@@ -249,17 +254,30 @@ def nearest_of_few(
 ) -> Int[Array, "few"]:
     """Find the nearest body triangle of a few points, three components (few,), each in its pose.
 
-    By exact distance to the triangles of the `BOXES` boxes that are nearest: for points that are few and far between this costs
-    less than the groups of a whole garment. Near the skin these hold the nearest; deep inside a body, of 2 cm and more, one in
-    twenty points finds another one.
+    By exact distance to the triangles of the box that is nearest, then of the next one, until none that is left is nearer than
+    what was found, for any point. Many boxes may hold a point: groups that are compact at rest, as of a hand and a thigh, are torn
+    apart by a pose. For points that are few and far between this costs less than the groups of a whole garment.
     """
-    x = [component[None] for component in x]
+    x, every = [component[None] for component in x], jnp.arange(len(pose))
     low, high = boxes.low[:, :, pose], boxes.high[:, :, pose]
     apart = [jnp.maximum(jnp.maximum(low[:, i] - x[i], x[i] - high[:, i]), 0) for i in range(3)]
-    names = boxes.triangles[smallest(dot(apart, apart), min(BOXES, len(low)))]  # (BOXES, few, size)
-    names = jnp.moveaxis(names, 2, 1).reshape(-1, len(pose))
-    triangle = [rows_at(body, surface.faces[:, k][names], pose[None]) for k in range(3)]
-    return jnp.take_along_axis(names, jnp.argmin(triangle_square(x, *triangle), axis=0)[None], axis=0)[0]
+
+    def look(state):
+        left, best, name = state
+        left, nearest = _take_smallest(left, 1)
+        names = boxes.triangles[nearest[0]].T  # (size, few)
+        triangle = [rows_at(body, surface.faces[:, k][names], pose[None]) for k in range(3)]
+        square = triangle_square(x, *triangle)
+        at = jnp.argmin(square, axis=0)
+        found, closer = square[at, every], square[at, every] < best
+        return left, jnp.where(closer, found, best), jnp.where(closer, names[at, every], name)
+
+    def may_be_nearer(state):
+        left, best, _ = state
+        return jnp.any(left.min(axis=0) < best)
+
+    start = dot(apart, apart), jnp.full(len(pose), jnp.inf, x[0].dtype), jnp.zeros(len(pose), jnp.int32)
+    return lax.while_loop(may_be_nearer, look, start)[2]
 
 
 def rows_at(table: Float[Array, "rows 3 poses"], row: Int[Array, "*#some"], pose: Int[Array, "*#some"]) -> Vector:

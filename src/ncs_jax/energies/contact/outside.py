@@ -97,6 +97,6 @@ def _of_those(
 
     def turn(k, found):
         at = lax.dynamic_slice_in_dim(todo, k * few, few)
-        return found.at[at].set(look(jnp.minimum(at, every - 1)), mode="drop")
+        return found.at[at].set(look(jnp.where(at < every, at, todo[0])), mode="drop")  # the last turn is filled with the first
 
     return lax.fori_loop(0, -(-jnp.sum(wanted) // few), turn, jnp.zeros((every, 3), dtype))
