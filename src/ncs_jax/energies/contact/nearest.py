@@ -255,8 +255,8 @@ def nearest_of_few(
     """Find the nearest body triangle of a few points, three components (few,), each in its pose.
 
     By exact distance to the triangles of the box that is nearest, then of the next one, until none that is left is nearer than
-    what was found, for any point. Many boxes may hold a point: groups that are compact at rest, as of a hand and a thigh, are torn
-    apart by a pose. For points that are few and far between this costs less than the groups of a whole garment.
+    what was found, for any point. Many boxes may hold a point, as groups that are compact at rest, of a hand and a thigh, are
+    torn apart by a pose. For points that are few and far between this costs less than the groups of a whole garment.
     """
     x, every = [component[None] for component in x], jnp.arange(len(pose))
     low, high = boxes.low[:, :, pose], boxes.high[:, :, pose]
