@@ -141,7 +141,7 @@ def test_without_contact_nothing_is_put_anywhere(trained, _plain):
     assert outside_body(replace(run.assembly.model, surface=None), run.track(clip), x) is x
 
 
-def test_edges_that_would_sink_into_a_limb_are_looked_at_in_their_middle():
+def test_edges_that_would_sink_into_a_limb_are_cut_until_they_do_not():
     """The longest of a triangle's edges against sqrt(8 LIMB margin) / STRETCHED; what contact looks at stays."""
     model = assembled().model
     mesh = model.garment.mesh
@@ -153,9 +153,12 @@ def test_edges_that_would_sink_into_a_limb_are_looked_at_in_their_middle():
         material = replace(model.material, thickness=jnp.float32(thickness))
         return pushing(replace(model, material=material, surface=replace(model.surface, **surface))).surface
 
-    few, every = points(1.01 * margin / MARGIN_OF), points(0.2 * margin / MARGIN_OF)
-    assert few.points is None and few.halfway is None
-    assert len(every.points.corners) == len(mesh.edges) and every.halfway is not None
+    few, middles, thirds, most = (points(share * margin / MARGIN_OF) for share in (1.01, 0.26, 0.12, 1e-3))
+    assert few.points is None and few.halfway is None and middles.halfway is not None
+    edges = len(mesh.edges)
+    assert [len(each.points.corners) for each in (middles, thirds, most)] == [
+        edges, 2 * edges + len(faces), 3 * edges + 3 * len(faces),
+    ]  # fmt: skip
     own = contact_points(faces, np.where(np.arange(len(faces)) == 3, 2, 1))
     kept = points(1.01 * margin / MARGIN_OF, points=own).points
     assert np.array_equal(kept.corners, own.corners) and np.array_equal(kept.weights, own.weights)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ncs_jax.energies.contact.halfway import halfway_from
 from ncs_jax.energies.contact.layers import rim_ways
 from ncs_jax.energies.contact.outside import put_outside
-from ncs_jax.energies.contact.points import contact_points
+from ncs_jax.energies.contact.points import MOST, contact_points
 from ncs_jax.energies.contact.surface import Surface
 from ncs_jax.geometry.enclosure import beside
 from ncs_jax.scene.features import MotionFeatures
@@ -41,9 +41,10 @@ def pushing(model: Model) -> Pushing | None:
     """Return what puts the model's garment outside of the body; None without contact.
 
     A network may stretch cloth beyond what contact was planned for, and skin shows between the points that it trains with. So
-    there are points in the middle of each edge that would sink by more than the margin if it were `STRETCHED` over a `LIMB`:
+    edges are cut into so many pieces, `MOST` at most, that none would sink by more than the margin were it `STRETCHED` over a
+    `LIMB`:
 
-        (STRETCHED L)^2 / (8 LIMB) > margin
+        (STRETCHED L / n)^2 / (8 LIMB) <= margin
 
     Skin `beside` the garment at rest, as that of an arm which presses into a dress, does not push: cloth would go around it.
     """
@@ -52,11 +53,13 @@ def pushing(model: Model) -> Pushing | None:
     body, mesh, surface = resting_body(model), model.garment.mesh, model.surface
     rest, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
     longest = np.linalg.norm(rest[faces] - rest[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
-    cut = (STRETCHED * longest) ** 2 / (8 * LIMB) > MARGIN * float(model.material.thickness)
+    sinks = (STRETCHED * longest) ** 2 / (8 * LIMB) / (MARGIN * float(model.material.thickness))
+    pieces = np.clip(np.ceil(np.sqrt(sinks)), 1, MOST).astype(int)
     if surface.points is not None:
         numbered = np.array([len(rest) ** 2, len(rest), 1], np.int64)
-        cut |= np.isin(faces @ numbered, np.asarray(surface.points.corners) @ numbered)
-    points = contact_points(faces, np.where(cut, 2, 1))
+        seen = np.isin(faces @ numbered, np.asarray(surface.points.corners) @ numbered)
+        pieces = np.maximum(pieces, np.where(seen, 2, 1))
+    points = contact_points(faces, pieces)
     halfway = None if points is None else surface.halfway or halfway_from(body)
     skin = jnp.asarray(~beside(body, rest, faces), model.basis.dtype)
     return Pushing(replace(surface, points=points, halfway=halfway), skin)
